@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.check import edit_json
 from support.commands import ON_A_PATH, words_of
 from support.export import export
 from support.mcap import rewritten
@@ -111,18 +112,15 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file.write_text(json.dumps(plain))
 
     export([good], folder / "dataset")
-    file = folder / "dataset" / "meta" / "info.json"
-    plain = json.loads(file.read_text())
-    plain["robot_type"] += HOSTILE
-    plain["features"]["observation.state"]["names"][0] += HOSTILE
-    file.write_text(json.dumps(plain))
+    info = Path("meta/info.json")
+    edit_json(folder / "dataset" / info, lambda plain: plain.update(robot_type=f"panda{HOSTILE}"))
+    names = [f"{HOSTILE}{number}" for number in range(8)]
+    edit_json(folder / "dataset" / info, lambda plain: plain["features"]["observation.state"].update(names=names))
     file = folder / "dataset" / "demorec" / "configs.json"  # refused by generate
     file.write_text(json.dumps(_everywhere(json.loads(file.read_text()))))
     shutil.copytree(folder / "dataset", folder / "damaged")
-    file = folder / "damaged" / "meta" / "info.json"
-    plain = json.loads(file.read_text())
-    plain["features"][HOSTILE] = {"dtype": HOSTILE, "shape": [1], "names": [HOSTILE]}
-    file.write_text(json.dumps(plain))
+    feature = {"dtype": HOSTILE, "shape": [1], "names": [HOSTILE]}
+    edit_json(folder / "damaged" / info, lambda plain: plain["features"].update({HOSTILE: feature}))
     return folder
 
 

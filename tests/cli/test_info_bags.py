@@ -43,18 +43,6 @@ def test_topics_types_counts_rates_and_span(
         assert any(line.split()[:2] == [topic, str(count)] and type_name in line for line in printed.splitlines())
 
 
-def test_a_truncated_bag_is_listed_up_to_its_end(
-    notes: bags.Notes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    whole = bags.write_mcap(notes, tmp_path / "x.mcap", chunk_size=10_000)
-    data = whole.read_bytes()
-    whole.write_bytes(data[: len(data) // 2])
-    assert exit_code("info", whole, "--json") == 0
-    plain = json.loads(capsys.readouterr().out)
-    assert 0 < plain["messages"] < len(notes)
-    assert plain["problems"]
-
-
 @pytest.mark.parametrize("command", ["info", "check", "view", "import"])
 def test_a_text_file_is_not_mcap(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "Dockerfile.mcap"

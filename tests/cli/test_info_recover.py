@@ -6,15 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
+from support.commands import exit_code
 from support.recording import make_episode, write_episode
 
-from demorec.cli import COMMANDS, run_command
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.runs.find import find
-
-
-def run(name: str, *args: str | Path) -> int:
-    return run_command(COMMANDS.load(name), [str(arg) for arg in args], prog=f"demorec {name}")
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_info_of_a_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("info", folder / "a.mcap") == 0
+    assert exit_code("info", folder / "a.mcap") == 0
     text = capsys.readouterr().out
     rows = dict(line.split("  ", 1) for line in text.split("\n\n")[0].splitlines())
     rows = {key: value.strip() for key, value in rows.items()}
@@ -48,14 +44,14 @@ def test_info_of_a_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 def test_info_as_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("info", folder / "a.mcap", "--json") == 0
+    assert exit_code("info", folder / "a.mcap", "--json") == 0
     found = json.loads(capsys.readouterr().out)
     with Recording(folder / "a.mcap") as recording:
         assert found["digest"] == recording.digest()
     assert (found["kind"], found["frames"], found["success"], found["root_seed"]) == ("recording", 45, True, 0)
     assert found["cameras"][0]["video"]["codec"] == "h264"
     assert found["cameras"][0]["depth"] is True
-    assert run("info", folder / "a.mcap", folder / "b.mcap", "--json") == 0
+    assert exit_code("info", folder / "a.mcap", folder / "b.mcap", "--json") == 0
     assert [item["episode_index"] for item in json.loads(capsys.readouterr().out)] == [0, 7]
 
 
@@ -63,24 +59,24 @@ def test_recover(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     part = tmp_path / "c.mcap.part"
     part.write_bytes((folder / "c.mcap.part").read_bytes())
     before = part.read_bytes()
-    assert run("recover", part) == 0
+    assert exit_code("recover", part) == 0
     assert capsys.readouterr().out == f"Kept 60 frames, then the end is missing: {tmp_path / 'c.mcap'}\n"
     with Recording(tmp_path / "c.mcap") as recording:
         assert (recording.num_frames, recording.outcome, recording.is_recovered) == (60, None, True)
     assert part.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c.mcap", "c.mcap.part"]
-    assert run("info", tmp_path / "c.mcap") == 0
+    assert exit_code("info", tmp_path / "c.mcap") == 0
     assert "unknown: recovered after a crash" in capsys.readouterr().out
-    assert run("recover", part) == 2
+    assert exit_code("recover", part) == 2
     assert "exists already" in capsys.readouterr().err
-    assert run("recover", part, "--overwrite") == 0
-    assert run("recover", part, "--out", tmp_path / "d.mcap") == 0
+    assert exit_code("recover", part, "--overwrite") == 0
+    assert exit_code("recover", part, "--out", tmp_path / "d.mcap") == 0
 
 
 def test_a_complete_recording_is_not_copied(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = tmp_path / "a.mcap"
     source.write_bytes((folder / "a.mcap").read_bytes())
-    assert run("recover", source) == 0
+    assert exit_code("recover", source) == 0
     assert capsys.readouterr().out == f"Nothing to recover, the recording is whole: {source}\n"
     assert list(tmp_path.iterdir()) == [source]
 
@@ -97,7 +93,7 @@ def test_a_recovered_recording_does_not_count_as_another_episode(
         (tmp_path / "run" / mark).write_text("{}")
     if is_inside:
         monkeypatch.chdir(damaged.parent)
-    assert run("recover", damaged.name if is_inside else damaged) == 0
+    assert exit_code("recover", damaged.name if is_inside else damaged) == 0
     place = tmp_path / "run" / ("recovered" if mark else "episodes") / "a.recovered.mcap"
     with Recording(place) as recording:
         assert recording.num_frames > 0
@@ -107,9 +103,9 @@ def test_a_recovered_recording_does_not_count_as_another_episode(
 
 def test_recover_without_intact_data(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cut = (folder / "c.mcap.part").read_bytes()[:3000]
-    assert run("recover", tmp_path / "nothing.mcap.part") == 2
+    assert exit_code("recover", tmp_path / "nothing.mcap.part") == 2
     for content, words in ((b"", "the file is empty"), (cut, "Nothing can be recovered")):
         (tmp_path / "empty.mcap.part").write_bytes(content)
-        assert run("recover", tmp_path / "empty.mcap.part") == 1
+        assert exit_code("recover", tmp_path / "empty.mcap.part") == 1
         assert words in capsys.readouterr().err
         assert not (tmp_path / "empty.mcap").exists()

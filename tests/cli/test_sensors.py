@@ -12,18 +12,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.check import rewrite_messages, simulate
+from support.commands import exit_code
 from support.export import export, feature_of
 
-from demorec.cli import COMMANDS, run_command
 from demorec.core.errors import RecordingError
 from demorec.episode.info import Feature, SensorStream
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.metadata import EPISODE, sealed
-
-
-def run(name: str, *args: str | Path) -> int:
-    return run_command(COMMANDS.load(name), [str(arg) for arg in args], prog=f"demorec {name}")
-
 
 SLIP = Feature(
     name="observation.finger.slip",
@@ -83,17 +78,17 @@ def test_every_command_uses_the_sensors_listed_in_a_recording(
             expected = [values_of(feature, frame) for frame in range(num_frames)]
             assert np.array_equal(table.features[feature.name], expected)
 
-    assert run("info", path, "--json") == 0
+    assert exit_code("info", path, "--json") == 0
     described = {row["name"]: row for row in json.loads(capsys.readouterr().out)["features"]}
     assert [name for name in described if described[name]["units"] and name in (*names, "observation.wrench")] == names
     for feature in sensors:
         assert described[feature.name]["elements"] == list(feature.names)
         assert described[feature.name]["source"] == feature.source
 
-    assert run("check", path) == 0
-    assert run("view", path, "--save", tmp_path / "e.rrd") == 0
+    assert exit_code("check", path) == 0
+    assert exit_code("view", path, "--save", tmp_path / "e.rrd") == 0
     assert (tmp_path / "e.rrd").stat().st_size > 0
-    assert run("replay", path) == 0
+    assert exit_code("replay", path) == 0
     export(path, tmp_path / "d", features=names)
     for feature in sensors:
         found, elements = feature_of(tmp_path / "d", feature.name, "lerobot")
@@ -138,5 +133,5 @@ def test_a_listed_sensor_without_its_messages_is_found(
 ) -> None:
     path = with_sensors(source, tmp_path / "e.mcap", [SLIP])
     rewrite_messages(path, tmp_path / "less.mcap", lambda message: [] if message[0] == "/finger/slip" else [message])
-    assert run("check", tmp_path / "less.mcap") == 1
+    assert exit_code("check", tmp_path / "less.mcap") == 1
     assert "/finger/slip is missing" in capsys.readouterr().out

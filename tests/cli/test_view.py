@@ -9,20 +9,15 @@ from typing import Literal
 
 import numpy as np
 import pytest
+from support.commands import exit_code
 from support.recording import make_episode, write_episode
 from support.viewer import chromium, need_chromium, need_vulkan, num_colors, pixels
 
-from demorec.cli import run_command
-from demorec.cli.view import View
 from demorec.core.config import VideoConfig
 from demorec.mcap import EpisodeWriter
 from demorec.view.scene import save_each
 from demorec.view.sources import find_episodes
 from demorec.view.viewer import HeadlessViewer, headless_viewer, serve_web
-
-
-def view(*args: object) -> int:
-    return run_command(View, [str(arg) for arg in args], prog="demorec view")
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +59,7 @@ def test_an_impossible_request_is_one_sentence(
     Path("folder").mkdir()
     Path("runs/cubes/episodes").mkdir(parents=True)
     write_episode(Path("episode.mcap"), num_frames=5, cameras=())
-    assert view(name, *flags) == 2
+    assert exit_code("view", name, *flags) == 2
     said = capsys.readouterr().err
     assert words in said
     assert len(said.strip().splitlines()) == 1
@@ -127,8 +122,8 @@ def test_the_viewer_shows_the_colours_that_were_recorded(codec: Literal["av1", "
 def test_a_screenshot_of_a_saved_file(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()
     episode = run_folder / "episodes" / "episode_000000.mcap"
-    assert view(episode, "--save", tmp_path / "x.rrd") == 0
-    assert view(tmp_path / "x.rrd", "--screenshot", tmp_path / "x.png", "--size", 900, 600) == 0
+    assert exit_code("view", episode, "--save", tmp_path / "x.rrd") == 0
+    assert exit_code("view", tmp_path / "x.rrd", "--screenshot", tmp_path / "x.png", "--size", 900, 600) == 0
     image = pixels((tmp_path / "x.png").read_bytes())
     assert image.shape == (600, 900, 3)
     assert num_colors(image) > 200

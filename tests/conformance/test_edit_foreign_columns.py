@@ -20,8 +20,9 @@ import pytest
 from numpy.typing import NDArray
 from support.commands import exit_code
 from support.drawn_datasets import PLAIN, STATE, DrawnDataset, encoded, write_drawn
-from support.export import recordings
+from support.export import data_table, recordings
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
+from support.stored_episodes import task_texts
 
 from demorec.datasets.lerobot.episode_places import are_on_grid
 from demorec.mcap import Recording
@@ -51,34 +52,26 @@ def foreign(root: Path, columns: Mapping[str, pa.Array | pa.ChunkedArray], *, dt
     return root
 
 
-def rows(root: Path) -> pa.Table:
-    return pa.concat_tables(pq.read_table(path) for path in sorted(root.glob("data/*/*.parquet")))
-
-
-def tasks(root: Path) -> list[str]:
-    table = pq.read_table(root / TASKS)
-    order = np.argsort(table["task_index"].to_numpy())
-    name = "task" if "task" in table.column_names else "__index_level_0__"
-    return [table[name].to_pylist()[place] for place in order]
-
-
 def said(root: Path, column: str) -> list[str]:
     """Return the task text behind each row's index."""
-    texts = tasks(root)
-    return [texts[number] for number in rows(root)[column].to_pylist()]
+    texts = task_texts(root)
+    return [texts[number] for number in data_table(root)[column].to_pylist()]
+
+
+def with_reversed_tasks(root: Path) -> Path:
+    """Give the tasks of such a dataset the numbers in the opposite order."""
+    pq.write_table(pa.table({"task": TEXTS[::-1], "task_index": range(len(TEXTS))}), root / TASKS)
+    episodes = pq.read_table(root / EPISODES).drop_columns("tasks")
+    texts = pa.array([[TEXTS[::-1][n]] for n in (4, 0, 1, 0)])
+    pq.write_table(episodes.append_column("tasks", texts), root / EPISODES)
+    return root
 
 
 def test_merging_renumbers_references(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     name = "annotation.task"
     numbers = np.arange(COUNT * LENGTH) % len(TEXTS)
     first = foreign(tmp_path / "a", {name: pa.array(numbers)})
-    second = foreign(tmp_path / "b", {name: pa.array(numbers)})
-    reversed_tasks = pa.table({"task": TEXTS[::-1], "task_index": range(len(TEXTS))})
-    pq.write_table(reversed_tasks, second / TASKS)
-    episodes = pq.read_table(second / EPISODES).drop_columns("tasks")
-    pq.write_table(
-        episodes.append_column("tasks", pa.array([[TEXTS[::-1][n]] for n in (4, 0, 1, 0)])), second / EPISODES
-    )
+    second = with_reversed_tasks(foreign(tmp_path / "b", {name: pa.array(numbers)}))
     expected = said(first, name) + said(second, name)
     assert exit_code("dataset", "merge", first, second, "--out", tmp_path / "new") == 0, capsys.readouterr().err
     assert said(tmp_path / "new", name) == expected
@@ -89,12 +82,7 @@ def test_columns_that_may_be_references_are_refused_where_numbers_change(
 ) -> None:
     numbers = pa.array(np.zeros(COUNT * LENGTH, np.int64))
     first = foreign(tmp_path / "a", {"subtask_id": numbers})
-    second = foreign(tmp_path / "b", {"subtask_id": numbers})
-    pq.write_table(pa.table({"task": TEXTS[::-1], "task_index": range(len(TEXTS))}), second / TASKS)
-    episodes = pq.read_table(second / EPISODES).drop_columns("tasks")
-    pq.write_table(
-        episodes.append_column("tasks", pa.array([[TEXTS[::-1][n]] for n in (4, 0, 1, 0)])), second / EPISODES
-    )
+    second = with_reversed_tasks(foreign(tmp_path / "b", {"subtask_id": numbers}))
     assert exit_code("dataset", "merge", first, second, "--out", tmp_path / "new") == 2
     assert "subtask_id may hold task numbers" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
@@ -215,7 +203,7 @@ def test_files_in_folders_that_differ_from_info_json_are_found(tmp_path: Path) -
     (source / "videos").rename(source / "video")
     before = pq.read_table(source / "data/chunk-000/episode_000001.parquet")
     assert exit_code("dataset", "select", source, "--episodes", "1", "--out", tmp_path / "new") == 0
-    assert rows(tmp_path / "new")["action"].to_pylist() == before["action"].to_pylist()
+    assert data_table(tmp_path / "new")["action"].to_pylist() == before["action"].to_pylist()
     assert not (tmp_path / "new/video").exists()  # its images are in videos/
 
 

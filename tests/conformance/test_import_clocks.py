@@ -19,13 +19,9 @@ GRIPPER = "/gripper/state"
 WALL_NS = bags.EPOCH_NS + 5 * bags.NS
 SLOWDOWN = 30 / 23
 """Recorded seconds for each second of a simulation that is slower than real time."""
-MAPPING = """
-[robot]
-name = "arm"
-[task]
-text = "stack the cups"
-[clock]
-fps = 30
+MAPPING = (
+    bag_mappings.HEAD.format(robot="arm")
+    + """
 [[features."observation.state"]]
 topic = "/joint_states"
 field = "position"
@@ -35,6 +31,7 @@ field = "position"
 [cameras.front]
 topic = "/front/rgb"
 """
+)
 
 
 def isaac(seconds: float = 3.0) -> bags.Notes:
@@ -63,13 +60,10 @@ def real(seconds: float = 2.0, *, skew_s: float = 0.0) -> bags.Notes:
     notes += bags.joints(ACTION, ("a", "b"), bags.times(100, seconds, seed=2), shift=0.1)
     notes += bags.jpeg_images(FRONT, bags.times(30, seconds, seed=3), 0, "front")
     notes = [replace(note, header_ns=note.header_ns - round(skew_s * bags.NS)) for note in notes]
-    notes += [
-        bags.Note(
-            topic=GRIPPER, type="std_msgs/msg/Float64MultiArray", log_ns=moment, header_ns=0,
-            body={"data": bags.motion(moment, 1)},
-        )
-        for moment in bags.times(100, seconds, seed=4)
-    ]  # fmt: skip
+    notes += bags.messages(
+        GRIPPER, "std_msgs/msg/Float64MultiArray", bags.times(100, seconds, seed=4),
+        lambda moment: {"data": bags.motion(moment, 1)}, has_header=False,
+    )  # fmt: skip
     return bags.in_order(notes)
 
 
@@ -202,23 +196,3 @@ def test_the_suggested_task_is_that_of_each_bag(
     for index, instruction in enumerate((task, "push the block")):
         with Recording(tmp_path / f"run/episodes/episode_{index:06d}.mcap") as recording:
             assert recording.info.instruction == instruction
-
-
-def test_an_action_of_the_next_state_and_a_gripper_command(imports: Imports, tmp_path: Path) -> None:
-    """Joint actions are the next state; gripper actions are the latest command of a separate topic, row by row."""
-    notes = real(3.0)
-    mapping = MAPPING.replace('[[features.action]]\ntopic = "/joint_command"\nfield = "position"\n', "")
-    mapping += '[[features.action]]\nnext = "observation.state"\n'
-    mapping += f'[[features.action]]\ntopic = "{GRIPPER}"\nfield = "data"\nprefix = "g"\nstamp = "log"\n'
-    code, told, error = imports(notes, mapping)
-    assert code == 0, told + error
-    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
-        table, info = recording.table(), recording.info
-    (action,) = [feature for feature in info.features if feature.name == "action"]
-    assert len(action.names) == 3
-    state = table.features["observation.state"]
-    grippers = [note for note in notes if note.topic == GRIPPER]
-    for row, values in enumerate(table.features["action"][:-1]):
-        time_ns = int(table.time_ns[row])
-        gripper = max((note for note in grippers if note.log_ns <= time_ns), key=lambda note: note.log_ns)
-        assert values.tolist() == [*state[row + 1].tolist(), *gripper.body["data"].tolist()]

@@ -24,21 +24,13 @@ from demorec.view.sources import find_episodes
 
 COLOR = "/camera/wrist/color/image_raw"
 DEPTH = "/camera/wrist/aligned_depth_to_color/image_raw"
-MAPPING = (
-    bag_mappings.HEAD.format(robot="so101")
-    + f"""
-[[features."observation.state"]]
-topic = "/follower/joint_states"
-field = "position"
-[[features.action]]
-topic = "/leader/joint_states"
-field = "position"
+MAPPING = f"""
+{bag_mappings.SO101.split("[cameras.front]")[0]}
 [cameras.wrist]
 topic = "{COLOR}"
 [cameras.wrist_depth]
 topic = "{DEPTH}"
 """
-)
 
 
 def millimetres(time_ns: int) -> NDArray[np.uint16]:
@@ -88,15 +80,12 @@ def notes_with_depth(kind: str, moments: Sequence[int]) -> bags.Notes:
     notes = [note for note in bags.so101(0.6) if "joint_states" in note.topic]
     notes += bags.raw_images(COLOR, moments, 1, "wrist_optical")
     name = "CompressedImage" if kind in ("png", "rvl") else "Image"
-    for moment in moments:
-        fields = body(kind, moment)
-        fields["data"] = np.frombuffer(bytes(fields["data"]), np.uint8)
-        notes.append(
-            bags.Note(
-                topic=DEPTH, type=f"sensor_msgs/msg/{name}", log_ns=moment + 21_000_000, header_ns=moment, body=fields,
-                frame_id="wrist_optical",
-            )
-        )  # fmt: skip
+
+    def fields(moment: int) -> dict[str, Any]:
+        found = body(kind, moment)
+        return found | {"data": np.frombuffer(bytes(found["data"]), np.uint8)}
+
+    notes += bags.messages(DEPTH, f"sensor_msgs/msg/{name}", moments, fields, latency_ns=21_000_000)
     return bags.in_order(notes)
 
 

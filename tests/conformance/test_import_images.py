@@ -7,44 +7,21 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support import bag_mappings, bags
+from support.bag_faults import ACTION, FRONT, SIDE, STATE
 from support.check import result_of
 from support.commands import exit_code
 
 from demorec.mcap import Recording
 
-FRONT, SIDE = "/front/image_raw/compressed", "/side/image_raw/compressed"
-STATE, ACTION = "/follower/joint_states", "/leader/joint_states"
 NAMES = ("a", "b")
-MAPPING = """
-[robot]
-name = "arm"
-[task]
-text = "stack the cups"
-[clock]
-fps = 30
-[[features."observation.state"]]
-topic = "/follower/joint_states"
-field = "position"
-[[features.action]]
-topic = "/leader/joint_states"
-field = "position"
-[cameras.front]
-topic = "/front/image_raw/compressed"
-[cameras.side]
-topic = "/side/image_raw/compressed"
-"""
+MAPPING = bag_mappings.SO101
 ONE_CAMERA = MAPPING.partition("[cameras.side]")[0]
-Write = Callable[[bags.Notes, Path], Path]
-WRITERS: dict[str, Write] = {
-    "rosbags": lambda notes, folder: bags.write_rosbag2(notes, folder / "stack_cups"),
-    "mcap": lambda notes, folder: bags.write_mcap(notes, folder / "stack_cups.mcap"),
-}
 
 
 def ticks(rate: float, count: int, *, phase: float = 0.0, jitter_s: float = 0.0, is_floored: bool = False) -> list[int]:
@@ -110,7 +87,7 @@ CLEAN: dict[str, Mapping[str, Sequence[int]]] = {
 )
 def test_no_image_is_lost(name: str, rows: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cameras = CLEAN[name]
-    path = WRITERS["rosbags" if "of" in name else "mcap"](bag(cameras), tmp_path)
+    path = bags.write_mcap(bag(cameras), tmp_path / "stack_cups.mcap")
     mapping = MAPPING if SIDE in cameras else ONE_CAMERA
     if rows == "suggested":
         mapping = suggested(path, capsys)
@@ -129,7 +106,7 @@ def test_no_image_is_lost(name: str, rows: str, tmp_path: Path, capsys: pytest.C
 def test_cameras_of_different_rates(fps: int, slow: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Rows follow the camera whose rate equals fps; repeated and unused images of other cameras are expected."""
     cameras = {FRONT: ticks(30, 90, jitter_s=0.001), SIDE: ticks(slow, 3 * slow, phase=0.2, jitter_s=0.001)}
-    path = WRITERS["rosbags"](bag(cameras), tmp_path)
+    path = bags.write_rosbag2(bag(cameras), tmp_path / "stack_cups")
     told, shown = imported(path, MAPPING.replace("fps = 30", f"fps = {fps}"), tmp_path, capsys)
     assert "No findings." in told
     times = cameras[FRONT if fps == 30 else SIDE]
@@ -142,7 +119,7 @@ def test_cameras_of_different_rates(fps: int, slow: int, tmp_path: Path, capsys:
 @pytest.mark.parametrize(("fps", "kind"), [(20, "skips"), (15, ""), (60, "repeats")])
 def test_a_rate_that_no_camera_has(fps: int, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Using every second image may be intended; using sometimes the second and sometimes the third cannot be."""
-    path = WRITERS["mcap"](bag({FRONT: ticks(30, 90, jitter_s=0.001)}), tmp_path)
+    path = bags.write_mcap(bag({FRONT: ticks(30, 90, jitter_s=0.001)}), tmp_path / "stack_cups.mcap")
     told, shown = imported(path, ONE_CAMERA.replace("fps = 30", f"fps = {fps}"), tmp_path, capsys)
     assert ("No findings." in told) == (not kind)
     left_out = 90 - len(set(shown["front"]))

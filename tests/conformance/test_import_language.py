@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +23,6 @@ ARM = [note for note in bags.so101(3.0) if "joint_states" in note.topic]
 MAPPING = bag_mappings.SO101.split("[cameras.front]")[0]
 SUBTASKS = '[subtasks]\ntopic = "/subtask"\n'
 SAID = ((0.41, "grasp the cup"), (0.7, "grasp the cup"), (1.013, "lift  the\tcup"), (1.5, ""), (2.2, "put it down"))
-
-
-def texts(topic: str, said: Sequence[tuple[float, str]]) -> bags.Notes:
-    """Messages of std_msgs/String, which has no header: the recording time counts."""
-    return [
-        bags.Note(
-            topic=topic, type="std_msgs/msg/String", log_ns=bags.EPOCH_NS + round(at * bags.NS), header_ns=0,
-            body={"data": text},
-        )
-        for at, text in said
-    ]  # fmt: skip
 
 
 def imported(notes: bags.Notes, mapping: str, folder: Path) -> int:
@@ -63,7 +51,7 @@ def rows_of(dataset: Path) -> list[dict[str, Any]]:
 def test_other_language_of_a_dataset_is_left_out(
     change: dict[str, str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
+    assert imported(bags.texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
     export(tmp_path / "run", tmp_path / "a", language=("subtask",))
     (file,) = sorted((tmp_path / "a" / "data").rglob("*.parquet"))
     table = pq.read_table(file)
@@ -83,7 +71,7 @@ def test_other_language_of_a_dataset_is_left_out(
 
 @pytest.mark.usefixtures("without_lerobot")
 def test_a_dataset_has_exactly_the_recorded_subtasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
+    assert imported(bags.texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
     (recording,) = recordings(tmp_path / "run")
     begun = ((0.41, "grasp the cup"), (1.013, "lift the cup"), (2.2, "put it down"))
     expected = [(row_at(recording, at), text) for at, text in begun]
@@ -103,19 +91,14 @@ def test_a_dataset_has_exactly_the_recorded_subtasks(tmp_path: Path, capsys: pyt
     assert not [result.check for result in report.results if result.verdict in ("broken", "look")]
 
 
-@pytest.mark.parametrize("kind", ["recording", pytest.param("dataset", marks=pytest.mark.slow)])
-def test_subtasks_are_shown_at_their_time(kind: str, tmp_path: Path) -> None:
-    assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
+def test_subtasks_are_shown_at_their_time(tmp_path: Path) -> None:
+    assert imported(bags.texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
     (recording,) = recordings(tmp_path / "run")
-    place = recording
-    if kind == "dataset":
-        place = tmp_path / "dataset"
-        export(tmp_path / "run", place, language=("subtask",))
     with Recording(recording) as opened:
         times = opened.table().time_ns
         expected = [(int(times[frame] - times[0]) / 1e9, text) for frame, text in opened.subtasks]
     assert len(expected) == 3
-    assert exit_code("view", place, "--save", tmp_path / "x.rrd") == 0
+    assert exit_code("view", recording, "--save", tmp_path / "x.rrd") == 0
     shown: list[tuple[float, str]] = []
     for chunk in RrdReader(tmp_path / "x.rrd").stream():
         if chunk.entity_path == "/words":
@@ -128,7 +111,7 @@ def test_subtasks_are_shown_at_their_time(kind: str, tmp_path: Path) -> None:
 
 
 def test_all_kinds_means_the_known_ones(tmp_path: Path) -> None:
-    assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
+    assert imported(bags.texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
     export(tmp_path / "run", tmp_path / "all", language=())
     assert {entry["style"] for row in rows_of(tmp_path / "all") for entry in row["language_persistent"]} == {"subtask"}
     with pytest.raises(ConfigError, match="has only the subtasks"):
@@ -138,7 +121,7 @@ def test_all_kinds_means_the_known_ones(tmp_path: Path) -> None:
 def test_markers_with_other_texts_are_subtasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = [(0.3, "start"), (0.5, "reach"), (1.2, "success"), (1.5, "start"), (2.4, "stop"), (2.6, "wave")]
     text = '[episodes]\ncut = "marker"\ntopic = "/marker"\n[subtasks]\ntopic = "/marker"\n'
-    assert imported(texts("/marker", said), text, tmp_path) == 0
+    assert imported(bags.texts("/marker", said), text, tmp_path) == 0
     first, second = recordings(tmp_path / "run")
     with Recording(first) as opened:
         assert [said for _, said in opened.subtasks] == ["reach"]
@@ -168,10 +151,10 @@ def test_subtasks_are_never_invented(tmp_path: Path, capsys: pytest.CaptureFixtu
 FAULTS: dict[str, tuple[bags.Notes, str, int, str]] = {
     "no text": ([], SUBTASKS.replace("/subtask", "/leader/joint_states") + 'field = "position"\n', 1, "is not a text"),
     "another field": (
-        texts("/subtask", SAID),
+        bags.texts("/subtask", SAID),
         SUBTASKS + 'field = "data"\n[episodes]\ncut = "marker"\ntopic = "/subtask"\nfield = "x"\n', 2, "subtasks.field",
     ),
-    "a control character": (texts("/subtask", [(1.0, "a\x1b[2J")]), SUBTASKS, 1, "not a single line"),
+    "a control character": (bags.texts("/subtask", [(1.0, "a\x1b[2J")]), SUBTASKS, 1, "not a single line"),
 }  # fmt: skip
 
 

@@ -11,14 +11,13 @@ from typing import Any
 
 import av
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from lerobot_datasets import CAMERA, DEPTH, write_by_lerobot
 from numpy.typing import NDArray
 from PIL import Image
-from support.check import edit_parquet
+from support.check import edit_json, edit_parquet
 from support.commands import exit_code
-from support.export import export, make_run, recordings
+from support.export import data_table, export, make_run, recordings
 
 from demorec.core.errors import DemorecError
 from demorec.extensions.imports.dataset_import import import_lerobot
@@ -48,18 +47,16 @@ def imported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 def columns_of(dataset: Path, name: str) -> NDArray[np.generic]:
     """(T, D) of all data files, by PyArrow."""
-    parts = [pq.read_table(file).column(name).to_pylist() for file in sorted((dataset / "data").rglob("*.parquet"))]
-    rows = [row for part in parts for row in part]
+    rows = data_table(dataset).column(name).to_pylist()
     return np.array(rows).reshape(len(rows), -1)
 
 
-def shown_by(dataset: Path) -> list[NDArray[np.uint8]]:
-    """All images of the camera in order, by av."""
-    images: list[NDArray[np.uint8]] = []
-    for file in sorted((dataset / "videos" / CAMERA).rglob("*.mp4")):
+def shown_by(dataset: Path, key: str, pixels: str = "rgb24") -> list[NDArray[Any]]:
+    """All images of a camera in order, by av."""
+    images: list[NDArray[Any]] = []
+    for file in sorted((dataset / "videos" / key).rglob("*.mp4")):
         with av.open(str(file)) as container:
-            shown = (frame.to_ndarray(format="rgb24") for frame in container.decode(video=0))
-            images += [np.asarray(image, dtype=np.uint8) for image in shown]
+            images += [frame.to_ndarray(format=pixels) for frame in container.decode(video=0)]
     return images
 
 
@@ -88,12 +85,10 @@ def test_images_are_kept_or_coded_once(imported: tuple[str, Path, Path]) -> None
             assert recording.info.cameras[0].kept == ("av1" if kind == "video" else "")
             found += list(recording.images(NAME))
     if kind == "image":
-        rows = [
-            row for file in sorted((dataset / "data").rglob("*.parquet")) for row in pq.read_table(file).to_pylist()
-        ]
-        expected = [np.asarray(Image.open(io.BytesIO(row[CAMERA]["bytes"])).convert("RGB")) for row in rows]
+        stored = data_table(dataset).column(CAMERA).to_pylist()
+        expected = [np.asarray(Image.open(io.BytesIO(image["bytes"])).convert("RGB")) for image in stored]
     else:
-        expected = shown_by(dataset)
+        expected = shown_by(dataset, CAMERA)
     assert len(found) == len(expected) == sum(LENGTHS)
     if kind == "video":
         assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
@@ -103,22 +98,13 @@ def test_images_are_kept_or_coded_once(imported: tuple[str, Path, Path]) -> None
             assert own < before / 2, index
 
 
-def codes_of(dataset: Path, key: str) -> list[NDArray[np.uint16]]:
-    """All depth images of a camera in order, by av."""
-    codes: list[NDArray[np.uint16]] = []
-    for file in sorted((dataset / "videos" / key).rglob("*.mp4")):
-        with av.open(str(file)) as container:
-            codes += [frame.to_ndarray(format="gray12le").astype(np.uint16) for frame in container.decode(video=0)]
-    return codes
-
-
 @pytest.mark.slow
 def test_distances_are_those_of_the_dataset(tmp_path: Path) -> None:
     """LeRobot defines the distance of each code, and an export writes the same codes."""
     from lerobot.datasets.depth_utils import dequantize_depth
 
     write_by_lerobot(tmp_path / "d", LENGTHS, depth=True)
-    codes = codes_of(tmp_path / "d", DEPTH)
+    codes = shown_by(tmp_path / "d", DEPTH, "gray12le")
     result = import_lerobot([tmp_path / "d"], None, tmp_path / "run")
     name = DEPTH.removeprefix("observation.images.")
     assert DEPTH not in result.left_out
@@ -145,7 +131,7 @@ def test_depth_of_another_scale_is_read_by_it_and_without_one_left_out(tmp_path:
     import_lerobot([tmp_path / "d"], None, tmp_path / "run")
     with Recording(recordings(tmp_path / "run")[0]) as recording:
         found = list(recording.distances(key.removeprefix("observation.images.")))
-    np.testing.assert_allclose(found, np.array(codes_of(tmp_path / "d", key)) / 1000, atol=1e-6)
+    np.testing.assert_allclose(found, np.array(shown_by(tmp_path / "d", key, "gray12le")) / 1000, atol=1e-6)
     del described["features"][key]["info"]["video.shift"]
     path.write_text(json.dumps(described))
     assert "scale of depth" in import_lerobot([tmp_path / "d"], None, tmp_path / "other").left_out[key]
@@ -172,10 +158,9 @@ def _no_video(dataset: Path) -> None:
 
 
 def _odd_name(dataset: Path) -> None:
-    path = dataset / "meta" / "info.json"
-    info = json.loads(path.read_text())
-    info["features"]["frames"] = info["features"].pop("action")
-    path.write_text(json.dumps(info))
+    edit_json(
+        dataset / "meta" / "info.json", lambda info: info["features"].update(frames=info["features"].pop("action"))
+    )
 
 
 FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {

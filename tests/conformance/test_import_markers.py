@@ -17,13 +17,8 @@ TAKES = [(0.2, "start"), (0.9, "stop"), (1.1, "start"), (1.8, "stop"), (2.0, "st
 
 
 def _import(tmp_path: Path, marks: list[tuple[float, str]], *, keys: str = "", more: str = "") -> int:
-    notes = bags.so101(3.0)
-    for seconds, word in marks:
-        time_ns = bags.EPOCH_NS + round(seconds * bags.NS)
-        notes.append(
-            bags.Note(topic=TOPIC, type="std_msgs/msg/String", log_ns=time_ns, header_ns=0, body={"data": word})
-        )
-    bag = bags.write_rosbag2(bags.in_order(notes), tmp_path / "bag")
+    notes = bags.in_order(bags.so101(3.0) + bags.texts(TOPIC, marks))
+    bag = bags.write_rosbag2(notes, tmp_path / "bag")
     text = f'{bag_mappings.SO101}[episodes]\ncut = "marker"\ntopic = "{TOPIC}"\n{keys}\n{more}'
     mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
     return exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run")

@@ -42,14 +42,6 @@ def test_it_is_imported_and_shown(version: str, tmp_path: Path) -> None:
         assert len(list(episode.packets("top"))) == PLAIN.lengths[1]
 
 
-def test_its_copy_in_the_new_format_is_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    root, copy = write_v21(tmp_path / "old"), tmp_path / "new"
-    for words in (["reorder", root, "--order", "1,0", "--out", copy], ["diff", root, copy]):
-        assert exit_code("dataset", *words) == 0, capsys.readouterr()
-    told = capsys.readouterr().out
-    assert "No difference: 2 of 2 and 2 episodes are the same." in told
-
-
 def test_an_export_that_would_append_names_the_command_that_converts_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

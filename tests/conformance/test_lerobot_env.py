@@ -125,11 +125,6 @@ def test_evaluate_records_every_rollout_continues_and_refuses_another(trained: P
     replaced = evaluate(other, trained / "b", num_episodes=1, workers=1, overwrite=True)
     assert replaced.settings.config.seed == 5
     assert len(list((trained / "b" / "failed").iterdir())) == 1
-    (trained / "mine").mkdir()
-    (trained / "mine" / "thesis.txt").write_text("precious")
-    with pytest.raises(ConfigError, match="not part of an evaluation"):
-        evaluate(other, trained / "mine", num_episodes=1, workers=1, overwrite=True)
-    assert (trained / "mine" / "thesis.txt").read_text() == "precious"
 
 
 @pytest.mark.long

@@ -123,7 +123,6 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "stale files (lerobot#2401)": (column("meta/episodes", "data/file_index", lambda v: [0] * len(v)), "entries of"),
     "scrambled ranges (lerobot#1919)": (
         column("meta/episodes", "dataset_from_index", lambda v: v[::-1]), "entries of"),
-    "wrong ends": (column("meta/episodes", "dataset_to_index", lambda v: [0] * len(v)), "entries of 0, 1, 2, 3"),
     "wrong lengths (lerobot#4143)": (
         column("meta/episodes", "length", lambda v: [v[0], 0, *v[2:]]), "entries of 1"),
     "images at wrong places (axol#158)": (

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.check import checked, copy, edit_column, edit_json, edit_parquet, simulate_run, verdict_of
+from support.check import checked, edit_column, edit_json, edit_parquet, simulate_run, verdict_of
 
 from demorec.check.report import CheckOptions, check_subjects, find_subjects
 from demorec.datasets.lerobot.export import export_lerobot
@@ -29,7 +29,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def run(good: Path, tmp_path: Path) -> Path:
     """A copy to be damaged."""
-    return copy(good, tmp_path / "run")
+    return shutil.copytree(good, tmp_path / "run")
 
 
 def first_line(key: str, value: Any) -> Callable[[Any], None]:
@@ -126,7 +126,7 @@ def test_a_dataset_that_differs_from_its_recordings(name: str, run: Path) -> Non
 @pytest.mark.slow
 def test_a_dataset_of_another_run(good: Path, tmp_path: Path) -> None:
     other = simulate_run(tmp_path / "other", 2, seed=4, fps=10, cameras=("front",))
-    copy(good / "dataset", other / "dataset")
+    shutil.copytree(good / "dataset", other / "dataset")
     assert verdict_of(other, "run_dataset", "run") == "broken"
 
 

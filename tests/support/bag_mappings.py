@@ -30,9 +30,6 @@ topic = "/gello/joint_states"
 field = "position"
 joints = ["fr3_joint1", "fr3_joint2", "fr3_joint3", "fr3_joint4", "fr3_joint5", "fr3_joint6", "fr3_joint7"]
 unit = "rad"
-[[features."observation.ee_pose"]]
-topic = "/franka_robot_state_broadcaster/current_pose"
-field = "pose"
 [cameras.wrist]
 topic = "/camera/wrist_camera/color/image_raw"
 info_topic = "/camera/wrist_camera/color/camera_info"

@@ -3,7 +3,7 @@
 A layout makes plain messages first, so that a test can damage them before they are written, and knows the bag's content
 without reading it. Topics, types, joint names and rates are those of:
 
-- franka: franka_ros2's broadcasters and GELLO's leader arm at up to 1 kHz, realsense2_camera, rosbag2 with MCAP;
+- franka: franka_ros2's joints and GELLO's leader arm at up to 1 kHz, realsense2_camera, rosbag2 with MCAP;
 - so101: so101_ros2's follower and leader, usb_cam's JPEG images, rosbag2 with SQLite;
 - trossen: Trossen SDK's protobuf joint states and Foxglove's CompressedVideo in MCAP.
 """
@@ -89,50 +89,63 @@ def jpeg(image: NDArray[np.uint8]) -> bytes:
     return buffer.getvalue()
 
 
-def joints(
-    topic: str, names: Sequence[str], moments: Sequence[int], *, shift: float = 0.0, latency: int = 500_000
+def messages(
+    topic: str,
+    type_name: str,
+    moments: Sequence[int],
+    body: Callable[[int], dict[str, Any]],
+    *,
+    latency_ns: int = 0,
+    has_header: bool = True,
+    frame_id: str = "",
 ) -> Notes:
-    """Messages of sensor_msgs/JointState."""
+    """Messages with a body for each time; `latency_ns` is the delay of their recording."""
     return [
         Note(
             topic=topic,
-            type="sensor_msgs/msg/JointState",
-            log_ns=moment + latency,
-            header_ns=moment,
-            body={"name": list(names), "position": motion(moment, len(names), shift=shift)},
+            type=type_name,
+            log_ns=moment + latency_ns,
+            header_ns=moment if has_header else 0,
+            body=body(moment),
+            frame_id=frame_id,
         )
         for moment in moments
     ]
+
+
+def texts(topic: str, said: Sequence[tuple[float, str]]) -> Notes:
+    """Messages of std_msgs/String, which has no header, at seconds after `EPOCH_NS`."""
+    words = {EPOCH_NS + round(at_s * NS): text for at_s, text in said}
+    return messages(topic, "std_msgs/msg/String", list(words), lambda time: {"data": words[time]}, has_header=False)
+
+
+def joints(
+    topic: str, names: Sequence[str], moments: Sequence[int], *, shift: float = 0.0, latency_ns: int = 500_000
+) -> Notes:
+    """Messages of sensor_msgs/JointState."""
+
+    def body(moment: int) -> dict[str, Any]:
+        return {"name": list(names), "position": motion(moment, len(names), shift=shift)}
+
+    return messages(topic, "sensor_msgs/msg/JointState", moments, body, latency_ns=latency_ns)
 
 
 def raw_images(topic: str, moments: Sequence[int], camera: int, frame_id: str) -> Notes:
     """Messages of sensor_msgs/Image, rgb8."""
-    return [
-        Note(
-            topic=topic,
-            type="sensor_msgs/msg/Image",
-            log_ns=moment + 20_000_000,
-            header_ns=moment,
-            body={"encoding": "rgb8", "width": WIDTH, "height": HEIGHT, "data": image(moment, camera)},
-            frame_id=frame_id,
-        )
-        for moment in moments
-    ]
+
+    def body(moment: int) -> dict[str, Any]:
+        return {"encoding": "rgb8", "width": WIDTH, "height": HEIGHT, "data": image(moment, camera)}
+
+    return messages(topic, "sensor_msgs/msg/Image", moments, body, latency_ns=20_000_000, frame_id=frame_id)
 
 
 def jpeg_images(topic: str, moments: Sequence[int], camera: int, frame_id: str) -> Notes:
     """Messages of sensor_msgs/CompressedImage, JPEG."""
-    return [
-        Note(
-            topic=topic,
-            type="sensor_msgs/msg/CompressedImage",
-            log_ns=moment + 15_000_000,
-            header_ns=moment,
-            body={"format": "jpeg", "data": np.frombuffer(jpeg(image(moment, camera)), np.uint8)},
-            frame_id=frame_id,
-        )
-        for moment in moments
-    ]
+
+    def body(moment: int) -> dict[str, Any]:
+        return {"format": "jpeg", "data": np.frombuffer(jpeg(image(moment, camera)), np.uint8)}
+
+    return messages(topic, "sensor_msgs/msg/CompressedImage", moments, body, latency_ns=15_000_000, frame_id=frame_id)
 
 
 FRANKA_JOINTS = tuple(f"fr3_joint{k}" for k in range(1, 8))
@@ -142,35 +155,18 @@ SO101_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wr
 
 def franka(seconds: float = 2.0) -> Notes:
     """A Franka arm with GELLO and two RealSense cameras."""
-    color = "/camera/{}/color/image_raw"
-    notes = joints("/joint_states", (*FRANKA_JOINTS, *FRANKA_FINGERS), times(1000, seconds, seed=1), latency=200_000)
+    names = (*FRANKA_JOINTS, *FRANKA_FINGERS)
+    notes = joints("/joint_states", names, times(1000, seconds, seed=1), latency_ns=200_000)
     notes += joints("/gello/joint_states", FRANKA_JOINTS, times(100, seconds, seed=2), shift=0.1)
-    notes += [
-        Note(
-            topic="/franka_robot_state_broadcaster/current_pose",
-            type="geometry_msgs/msg/PoseStamped",
-            log_ns=moment + 200_000,
-            header_ns=moment,
-            body={"pose": pose(moment)},
-            frame_id="fr3_link0",
-        )
-        for moment in times(200, seconds, seed=3)
-    ]
     for camera, name in enumerate(("wrist_camera", "scene_camera")):
         moments = times(30, seconds, seed=4 + camera)
-        notes += raw_images(color.format(name), moments, camera, f"{name}_color_optical_frame")
-        notes += [
-            Note(
-                topic=f"/camera/{name}/color/camera_info",
-                type="sensor_msgs/msg/CameraInfo",
-                log_ns=moment + 20_000_000,
-                header_ns=moment,
-                body={"k": np.array([60.0, 0, 32, 0, 60.0, 24, 0, 0, 1])},
-                frame_id=f"{name}_color_optical_frame",
-            )
-            for moment in moments
-        ]
+        notes += raw_images(f"/camera/{name}/color/image_raw", moments, camera, name)
+        notes += messages(f"/camera/{name}/color/camera_info", "sensor_msgs/msg/CameraInfo", moments, _intrinsics)
     return notes
+
+
+def _intrinsics(_: int) -> dict[str, Any]:
+    return {"k": np.array([60.0, 0, 32, 0, 60.0, 24, 0, 0, 1])}
 
 
 def pose(moment: int) -> dict[str, Any]:
@@ -187,13 +183,9 @@ def so101(seconds: float = 2.0) -> Notes:
     """An SO-101 leader and follower with two USB cameras."""
     notes = joints("/follower/joint_states", SO101_JOINTS, times(50, seconds, seed=1))
     notes += joints("/leader/joint_states", SO101_JOINTS, times(50, seconds, phase=0.004, seed=2), shift=0.1)
-    for camera, (topic, frame) in enumerate(
-        (
-            ("/follower/cam_front/image_raw/compressed", "cam_front"),
-            ("/static_camera/cam_side/image_raw/compressed", "cam_side"),
-        )
-    ):
-        notes += jpeg_images(topic, times(30, seconds, seed=3 + camera), camera, frame)
+    topics = ("/follower/cam_front/image_raw/compressed", "/static_camera/cam_side/image_raw/compressed")
+    for camera, topic in enumerate(topics):
+        notes += jpeg_images(topic, times(30, seconds, seed=3 + camera), camera, topic.split("/")[2])
     return notes
 
 
@@ -201,31 +193,20 @@ def trossen(seconds: float = 2.0, *, gop: int = 10) -> Notes:
     """Trossen's arms and cameras, the images encoded as H.264."""
     notes: Notes = []
     for number, arm in enumerate(("leader", "follower")):
-        for moment in times(200, seconds, seed=1 + number):
-            positions = motion(moment, 7, shift=0.1 * number).astype(np.float32)
-            notes.append(
-                Note(
-                    topic=f"{arm}/joints/state",
-                    type="trossen_sdk.msg.JointState",
-                    log_ns=moment,
-                    header_ns=moment,
-                    body={"positions": positions},
-                )
-            )
+
+        def positions(moment: int, shift: float = 0.1 * number) -> dict[str, Any]:
+            return {"positions": motion(moment, 7, shift=shift).astype(np.float32)}
+
+        moments = times(200, seconds, seed=1 + number)
+        notes += messages(f"{arm}/joints/state", "trossen_sdk.msg.JointState", moments, positions)
     for camera, name in enumerate(("cam_high", "cam_wrist")):
         moments = times(30, seconds, seed=3 + camera)
-        packets = video([image(moment, camera) for moment in moments], gop=gop)
-        notes += [
-            Note(
-                topic=f"/cameras/{name}/image",
-                type="foxglove.CompressedVideo",
-                log_ns=moment,
-                header_ns=moment,
-                body={"format": "h264", "data": packet},
-                frame_id=name,
-            )
-            for moment, packet in zip(moments, packets, strict=True)
-        ]
+        packets = dict(zip(moments, video([image(moment, camera) for moment in moments], gop=gop), strict=True))
+
+        def encoded(moment: int, packets: dict[int, bytes] = packets) -> dict[str, Any]:
+            return {"format": "h264", "data": packets[moment]}
+
+        notes += messages(f"/cameras/{name}/image", "foxglove.CompressedVideo", moments, encoded, frame_id=name)
     return notes
 
 
@@ -251,12 +232,6 @@ def video(
 @functools.cache
 def _store(*, is_ros1: bool = False) -> Any:
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-
-
-def ros_message(note: Note, *, is_ros1: bool = False) -> Any:
-    """Make a message with `rosbags`."""
-    store = _store(is_ros1=is_ros1)
-    return _filled(store, note.type, note.body | {"header": note}, is_ros1)
 
 
 def _filled(store: Any, name: str, body: dict[str, Any], is_ros1: bool) -> Any:
@@ -301,35 +276,34 @@ def write_rosbag2(
     writer = Writer(path, version=9, storage_plugin=storage)
     if compression is not None:
         writer.set_compression(compression, CompressionFormat.ZSTD)
-    store = _store()
-    with writer:
-        connections: dict[str, Any] = {}
-        for note in notes:
-            if note.topic not in connections:
-                connections[note.topic] = writer.add_connection(note.topic, note.type, typestore=store)
-            data = note.data
-            if data is None:
-                data = store.serialize_cdr(ros_message(note), note.type)
-            writer.write(connections[note.topic], note.log_ns, data)
-    return path
+    return _written(writer, notes, path, is_ros1=False)
 
 
 def write_ros1(notes: Notes, path: Path, *, compression: Ros1Writer.CompressionFormat | None = None) -> Path:
     """Write a bag of ROS 1 with `rosbags`."""
-    store = _store(is_ros1=True)
     writer = Ros1Writer(path)
     if compression is not None:
         writer.set_compression(compression)
+    return _written(writer, notes, path, is_ros1=True)
+
+
+def _written(writer: Any, notes: Notes, path: Path, *, is_ros1: bool) -> Path:
+    store = _store(is_ros1=is_ros1)
     with writer:
         connections: dict[str, Any] = {}
         for note in notes:
             if note.topic not in connections:
                 connections[note.topic] = writer.add_connection(note.topic, note.type, typestore=store)
-            data = note.data
-            if data is None:
-                data = store.serialize_ros1(ros_message(note, is_ros1=True), note.type)
-            writer.write(connections[note.topic], note.log_ns, data)
+            writer.write(connections[note.topic], note.log_ns, _serialised(note, is_ros1=is_ros1))
     return path
+
+
+def _serialised(note: Note, *, is_ros1: bool) -> bytes:
+    if note.data is not None:
+        return note.data
+    store = _store(is_ros1=is_ros1)
+    serialise: Callable[..., memoryview] = store.serialize_ros1 if is_ros1 else store.serialize_cdr
+    return bytes(serialise(_filled(store, note.type, note.body | {"header": note}, is_ros1), note.type))
 
 
 def write_mcap(
@@ -360,10 +334,7 @@ def write_mcap(
                     text.encode(),
                 )
                 channels[note.topic] = writer.register_channel(note.topic, "ros1" if is_ros1 else "cdr", schema)
-            data = note.data
-            if data is None:
-                serialise: Callable[..., memoryview] = store.serialize_ros1 if is_ros1 else store.serialize_cdr
-                data = bytes(serialise(ros_message(note, is_ros1=is_ros1), note.type))
+            data = _serialised(note, is_ros1=is_ros1)
             writer.add_message(channels[note.topic], note.log_ns, data, note.log_ns)
         writer.finish()
     return path

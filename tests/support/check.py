@@ -6,7 +6,6 @@ Nothing here depends on the checks. Every function that damages something assert
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import replace
@@ -272,9 +271,3 @@ def edit_json(path: Path, change: Callable[[Any], object]) -> None:
     change(data)
     assert json.dumps(data) != before
     path.write_text(json.dumps(data))
-
-
-def copy(source: Path, target: Path) -> Path:
-    """A copy of a folder."""
-    shutil.copytree(source, target)
-    return target

@@ -13,10 +13,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from support.drawn_datasets import write_tables
+from support.foreign_dataset import COUNTERS, counters
 
 FPS, LENGTH, EPISODES, LATE = 30, 120, 4, 3
 JOINTS = ("shoulder", "elbow", "wrist", "gripper")
-_COUNTERS = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
 
 
 @dataclass(frozen=True)
@@ -120,27 +120,18 @@ def write_convention(root: Path, convention: Convention, *, frozen: bool = False
         name: {"dtype": "float32", "shape": [values.shape[1]], "names": names}
         for name, (names, values) in vectors.items()
     }
-    features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _COUNTERS.items()}
+    features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in COUNTERS.items()}
     info = {"codebase_version": convention.version, "fps": FPS, "robot_type": "arm", "features": features}
-    write_tables(root, info, [_rows(vectors, episode) for episode in range(EPISODES)], ["wave"])
+    columns: dict[str, Any] = {
+        name: pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])
+        if values.shape[1] > 1
+        else pa.array(values[:, 0])
+        for name, (_, values) in vectors.items()
+    }
+    table = pa.table(columns | counters(LENGTH, EPISODES, FPS))
+    write_tables(root, info, [table.slice(LENGTH * number, LENGTH) for number in range(EPISODES)], ["wave"])
     if convention.version == "v3.0":
         (root / "meta/stats.json").write_text("{}")
     if convention.modality is not None:
         (root / "meta/modality.json").write_text(json.dumps(convention.modality))
     return root
-
-
-def _rows(vectors: Mapping[str, tuple[Any, NDArray[np.float32]]], episode: int) -> pa.Table:
-    rows = slice(episode * LENGTH, (episode + 1) * LENGTH)
-    columns: dict[str, Any] = {
-        name: pa.FixedSizeListArray.from_arrays(pa.array(values[rows].reshape(-1)), values.shape[1])
-        if values.shape[1] > 1
-        else pa.array(values[rows, 0])
-        for name, (_, values) in vectors.items()
-    }
-    columns["timestamp"] = (np.arange(LENGTH) / FPS).astype(np.float32)
-    columns["frame_index"] = np.arange(LENGTH)
-    columns["episode_index"] = np.full(LENGTH, episode)
-    columns["index"] = np.arange(rows.start, rows.stop)
-    columns["task_index"] = np.zeros(LENGTH, np.int64)
-    return pa.table(columns)

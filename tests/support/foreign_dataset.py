@@ -15,7 +15,19 @@ from support.drawn_datasets import write_tables
 
 DATA, TASKS = "data/chunk-000/file-000.parquet", "meta/tasks.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
-_COUNTERS = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
+COUNTERS = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
+
+
+def counters(length: int, episodes: int, fps: int) -> dict[str, Any]:
+    """Columns that count the rows of episodes of the same length, all of task 0."""
+    frames = np.tile(np.arange(length), episodes)
+    return {
+        "timestamp": (frames / fps).astype(np.float32),
+        "frame_index": frames,
+        "episode_index": np.repeat(np.arange(episodes), length),
+        "index": np.arange(len(frames)),
+        "task_index": np.zeros(len(frames), np.int64),
+    }
 
 
 def write_foreign(
@@ -36,7 +48,7 @@ def write_foreign(
         "observation.state": {"dtype": "float32", "shape": [width], "names": names},
         "action": {"dtype": "float32", "shape": [width], "names": None},
         "observation.images.top": {"dtype": "image", "shape": [size[1], size[0], 3], "names": None},
-        **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _COUNTERS.items()},
+        **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in COUNTERS.items()},
     }
     shown = io.BytesIO()
     Image.new("RGB", size).save(shown, "PNG")
@@ -48,11 +60,7 @@ def write_foreign(
         "observation.state": pa.FixedSizeListArray.from_arrays(numbers, width),
         "action": pa.FixedSizeListArray.from_arrays(numbers, width),
         "observation.images.top": pa.array([{"bytes": shown.getvalue(), "path": None}] * rows, kind),
-        "timestamp": (np.tile(np.arange(length), episodes) / 10).astype(np.float32),
-        "frame_index": np.tile(np.arange(length), episodes),
-        "episode_index": np.repeat(np.arange(episodes), length),
-        "index": np.arange(rows),
-        "task_index": np.zeros(rows, np.int64),
+        **counters(length, episodes, 10),
     }
     info = {"codebase_version": "v3.0", "fps": 10, "robot_type": "so100", "features": shapes}
     table = pa.table(columns)

@@ -218,14 +218,16 @@ class Fuzzed:
         data, form = chance.choice(self._images), chance.choice(_IMAGE_FORMATS)
         sizes = [chance.choice((64, 48, 0, 1, 3, 2**31, 2**32 - 1)) for _ in range(3)]
         is_raw, encoding = chance.random() < 0.3, chance.choice(("rgb8", "bayer_rggb8", "uyvy", "16UC1", "32FC1", "x"))
-        notes = bags.joints("/joints", ("a", "b"), bags.times(50, 0.3))
-        for moment in bags.times(30, 0.3):
+
+        def body(_: int) -> dict[str, Any]:
             pixels = np.frombuffer(changed_bytes(data, chance), np.uint8)
-            body: dict[str, Any] = {"format": form, "data": pixels}
             if is_raw:
-                body = {"encoding": encoding, "width": sizes[0], "height": sizes[1], "step": sizes[2], "data": pixels}
-            kind = f"sensor_msgs/msg/{'Image' if is_raw else 'CompressedImage'}"
-            notes.append(bags.Note(topic="/image", type=kind, log_ns=moment, header_ns=moment, body=body))
+                return {"encoding": encoding, "width": sizes[0], "height": sizes[1], "step": sizes[2], "data": pixels}
+            return {"format": form, "data": pixels}
+
+        kind = f"sensor_msgs/msg/{'Image' if is_raw else 'CompressedImage'}"
+        notes = bags.joints("/joints", ("a", "b"), bags.times(50, 0.3))
+        notes += bags.messages("/image", kind, bags.times(30, 0.3), body)
         bag = bags.write_mcap(bags.in_order(notes), self.folder / "image.mcap")
         return self._imported(bag, MAPPING.replace('[episodes]\ncut = "marker"\ntopic = "/text"\n', ""), chance)
 

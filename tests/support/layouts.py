@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from support import bags
-from support.bags import EPOCH_NS, NS, Note, Notes, motion
+from support.bags import EPOCH_NS, NS, Notes, motion
 
 SECONDS = 1.5
 Body = dict[str, Any]
@@ -53,10 +53,7 @@ IMAGES = moments(30, begin_ns=EPOCH_NS + NS // 20)
 
 
 def messages(topic: str, kind: str, body: Callable[[int], Body], *, has_header: bool = True) -> Notes:
-    return [
-        Note(topic=topic, type=kind, log_ns=time, header_ns=time if has_header else 0, body=body(time))
-        for time in moments(50)
-    ]
+    return bags.messages(topic, kind, moments(50), body, has_header=has_header)
 
 
 def joints(topic: str, names: Sequence[str], *, shift: float = 0.0, rate: int = 50) -> Notes:
@@ -81,7 +78,7 @@ def depth_camera(topic: str) -> Notes:
     distances = np.full((bags.HEIGHT, bags.WIDTH), 500, np.uint16)
     body = {"encoding": "16UC1", "width": bags.WIDTH, "height": bags.HEIGHT, "step": 2 * bags.WIDTH,
             "data": np.frombuffer(distances.tobytes(), np.uint8)}  # fmt: skip
-    return [Note(topic=topic, type="sensor_msgs/msg/Image", log_ns=time, header_ns=time, body=body) for time in IMAGES]
+    return bags.messages(topic, "sensor_msgs/msg/Image", IMAGES, lambda time: body)
 
 
 def scalar(topic: str, *, shift: float = 0.0, kind: str = "Float64") -> Notes:
