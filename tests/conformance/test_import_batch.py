@@ -5,15 +5,11 @@ from __future__ import annotations
 import errno
 import json
 import os
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
@@ -241,20 +237,3 @@ def test_bags_before_a_bad_one_are_imported(workers: int, tmp_path: Path) -> Non
         import_bags(good, mapping, run, workers=workers)
     assert [path.name for path in run.glob("episodes/*")] == ["episode_000000.mcap"]
     assert len(load_any_run_file(run).attempts) == 1
-
-
-def test_a_killed_import_continues_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    words = ["import", *map(str, (batch[0], "--mapping", batch[1], "--out", run)), "--skip-bad", "--workers", "2"]
-    with subprocess.Popen([sys.executable, "-m", "demorec", *words], stdout=subprocess.DEVNULL) as program:
-        while not list(run.glob("episodes/*.mcap")) and program.poll() is None:
-            time.sleep(0.001)
-        children = psutil.Process(program.pid).children(recursive=True)
-        program.kill()
-    _, alive = psutil.wait_procs(children, timeout=30)
-    assert not alive
-    assert load_any_run_file(run).planned, "a kill at any moment leaves a run that lists the missing episodes"
-    import_bags([batch[0]], batch[1], run, skip_bad=True)
-    assert not load_any_run_file(run).planned
-    assert _content(run) == _content(alone)
-    assert load_any_run_file(run).digest == load_any_run_file(alone).digest

@@ -227,34 +227,6 @@ def test_lerobot_continues_recording_and_then_demorec_appends(run: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_append_to_a_dataset_that_lerobot_wrote_from_the_start(run: Path, tmp_path: Path) -> None:
-    from lerobot.configs.video import RGBEncoderConfig
-    from lerobot.datasets import LeRobotDataset
-
-    root = tmp_path / "d"
-    joints = [f"panda_joint{n}.pos" for n in range(1, 8)] + ["gripper.width"]
-    features = {
-        "action": {"dtype": "float32", "shape": (8,), "names": joints},
-        "observation.state": {"dtype": "float32", "shape": (8,), "names": joints},
-        "observation.images.front": {"dtype": "video", "shape": (48, 64, 3), "names": ["height", "width", "channels"]},
-    }
-    encoder = RGBEncoderConfig(vcodec="h264", crf=23, preset="veryfast")
-    theirs = LeRobotDataset.create("local/test", 30, features, root=root, robot_type="panda", rgb_encoder=encoder)
-    rng = np.random.default_rng(0)
-    for t in range(13):
-        grey = np.full((48, 64, 3), 10 * t, dtype=np.uint8)
-        vector = rng.normal(size=8).astype(np.float32)
-        theirs.add_frame({"action": vector, "observation.state": vector, "observation.images.front": grey, "task": "t"})
-    theirs.save_episode()
-    theirs.finalize()
-    report = export(run, root, episodes="1", append=True)
-    assert report.num_frames == 28
-    assert set(report.left_out) >= {"observation.images.wrist", "next.done"}
-    found = assert_readable(root, (13, 15))
-    assert np.array_equal(image(found[13 + 14], "front"), recorded_images(run, 1)["front"][14])
-
-
-@pytest.mark.slow
 def test_lerobot_doctor_finds_no_fault(run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d", video_files_mb=0.006, data_files_mb=0.03)
     text = lerobot_command("lerobot-doctor", "check", str(tmp_path / "d"), "--ci")

@@ -73,6 +73,5 @@ topic = "/cameras/cam_wrist/image"
 
 
 def write_mapping(text: str, path: Path) -> Path:
-    """Write a mapping to a file."""
     path.write_text(text)
     return path

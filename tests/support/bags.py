@@ -83,7 +83,6 @@ def image(time_ns: int, camera: int) -> NDArray[np.uint8]:
 
 
 def jpeg(image: NDArray[np.uint8]) -> bytes:
-    """Encode an image as JPEG."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="JPEG", quality=90)
     return buffer.getvalue()
@@ -122,8 +121,6 @@ def texts(topic: str, said: Sequence[tuple[float, str]]) -> Notes:
 def joints(
     topic: str, names: Sequence[str], moments: Sequence[int], *, shift: float = 0.0, latency_ns: int = 500_000
 ) -> Notes:
-    """Messages of sensor_msgs/JointState."""
-
     def body(moment: int) -> dict[str, Any]:
         return {"name": list(names), "position": motion(moment, len(names), shift=shift)}
 
@@ -131,8 +128,6 @@ def joints(
 
 
 def raw_images(topic: str, moments: Sequence[int], camera: int, frame_id: str) -> Notes:
-    """Messages of sensor_msgs/Image, rgb8."""
-
     def body(moment: int) -> dict[str, Any]:
         return {"encoding": "rgb8", "width": WIDTH, "height": HEIGHT, "data": image(moment, camera)}
 
@@ -140,8 +135,6 @@ def raw_images(topic: str, moments: Sequence[int], camera: int, frame_id: str) -
 
 
 def jpeg_images(topic: str, moments: Sequence[int], camera: int, frame_id: str) -> Notes:
-    """Messages of sensor_msgs/CompressedImage, JPEG."""
-
     def body(moment: int) -> dict[str, Any]:
         return {"format": "jpeg", "data": np.frombuffer(jpeg(image(moment, camera)), np.uint8)}
 
@@ -170,7 +163,6 @@ def _intrinsics(_: int) -> dict[str, Any]:
 
 
 def pose(moment: int) -> dict[str, Any]:
-    """A pose that moves."""
     angle = 0.3 * np.sin((moment - EPOCH_NS) / NS)
     position = motion(moment, 3)
     return {
@@ -423,5 +415,4 @@ def changed(notes: Notes, topic: str, change: Callable[[int, Note], Note | None]
 
 
 def with_body(note: Note, **fields: Any) -> Note:
-    """Copy a message with other fields."""
     return replace(note, body=note.body | fields)

@@ -40,7 +40,6 @@ Images = list[dict[str, CameraImages]]
 
 
 def simulate(path: Path, *, episode_index: int = 0, **config: Any) -> Path:
-    """Make and record one episode."""
     config = {"cameras": (), "width": 96, "height": 96, **config}
     plan = EpisodePlan(config=GenerateConfig(**config), episode_index=episode_index)
     episode = prepare(plan)
@@ -137,7 +136,6 @@ class Spoilt:
         self.frames = list(range(len(self._frames)))
 
     def set(self, **arrays: Any) -> None:
-        """Replace columns."""
         for name, array in arrays.items():
             before = getattr(self.columns, name)
             same = (
@@ -149,7 +147,6 @@ class Spoilt:
         self.columns = replace(self.columns, **arrays)
 
     def pose_of(self, name: str, rows: Any) -> None:
-        """Replace the poses of an object."""
         self.set(object_poses={**self.columns.object_poses, name: np.asarray(rows)})
 
     def image(self, camera: str, change: Callable[[int, np.ndarray[Any, Any]], Any]) -> None:
@@ -164,7 +161,6 @@ class Spoilt:
         self.images = new
 
     def write(self, path: Path) -> Path:
-        """Record the episode."""
         with Recording(self._source) as recording:
             frames = list(frames_of(self.columns, recording.events(), recording.joint_samples()))
         outcome = self.outcome
@@ -256,7 +252,6 @@ def edit_column(dataset: Path, name: str, change: Callable[[np.ndarray[Any, Any]
 
 
 def change_table(dataset: Path, place: str, change: Callable[[pa.Table], pa.Table]) -> None:
-    """Change the first table below a folder of a dataset."""
     path = next(dataset.glob(f"{place}/*/*.parquet"))
     table = pq.read_table(path)
     changed = change(table)
@@ -265,7 +260,6 @@ def change_table(dataset: Path, place: str, change: Callable[[pa.Table], pa.Tabl
 
 
 def edit_json(path: Path, change: Callable[[Any], object]) -> None:
-    """Change a JSON file in place."""
     data = json.loads(path.read_text())
     before = json.dumps(data)
     change(data)

@@ -76,7 +76,6 @@ class DrawnDataset:
 
     @property
     def total(self) -> int:
-        """Frames of all episodes."""
         return sum(self.lengths)
 
 
@@ -129,7 +128,6 @@ def write_drawn(root: Path, drawn: DrawnDataset, seed: int = 0) -> Path:
 
 
 def _columns(drawn: DrawnDataset, random: np.random.Generator, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Columns of all rows, and the features of info.json."""
     total, episodes = drawn.total, np.repeat(np.arange(len(drawn.lengths)), drawn.lengths)
     frames = np.concatenate([np.arange(length) for length in drawn.lengths])
     state, action = (random.normal(size=(total, 3)) for _ in range(2))

@@ -80,12 +80,10 @@ def without_verification(patch: pytest.MonkeyPatch) -> None:
 
 
 def data_table(dataset: Path) -> pa.Table:
-    """All rows of a dataset."""
     return pa.concat_tables([pq.read_table(path) for path in sorted((dataset / "data").glob("*/*.parquet"))])
 
 
 def episode_rows(dataset: Path) -> list[dict[str, Any]]:
-    """All rows of the table of episodes."""
     return [
         row
         for path in sorted((dataset / "meta" / "episodes").glob("*/*.parquet"))
@@ -94,7 +92,6 @@ def episode_rows(dataset: Path) -> list[dict[str, Any]]:
 
 
 def info(dataset: Path) -> dict[str, Any]:
-    """info.json."""
     found: dict[str, Any] = json.loads((dataset / "meta" / "info.json").read_text())
     return found
 

@@ -129,7 +129,6 @@ def write_images_and_frames(writer: SampledWriter, episode: Episode) -> None:
 
 
 def write_external(path: Path, episode: Episode | None = None, *, video: VideoConfig | None = None) -> Path:
-    """Record an external episode."""
     episode = episode or make_external()
     with SampledWriter(path, episode.info, video=video) as writer:
         write_images_and_frames(writer, episode)

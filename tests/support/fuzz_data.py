@@ -142,7 +142,6 @@ class Fuzzed:
         hdf5.write_robomimic(folder / "robomimic.hdf5")
 
     def clear(self) -> None:
-        """Remove a command's output."""
         for path in self.folder.glob("out*"):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 

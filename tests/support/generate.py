@@ -21,7 +21,6 @@ from support.makers import line_of, succeeds
 
 
 def inspect(path: Path) -> tuple[Attempt, dict[str, Any], dict[str, str]]:
-    """Read a stand-in recording."""
     try:
         content = json.loads(read_text_limited(path, 100_000))
         return line_of(path, content, path.name), content["config"], content["versions"]
@@ -59,7 +58,6 @@ def run_fake(
     progress: RunObserver | None = None,
     episodes: list[int] | None = None,
 ) -> RunResult:
-    """Generate a run of stand-in recordings."""
     return generate(
         GenerateConfig(seed=seed, cameras=()),
         RunOptions(
@@ -83,15 +81,14 @@ def attempts_of(result: RunResult) -> dict[tuple[int, int], bool]:
 
 
 def num_finished(out: Path) -> int:
-    """Number of recordings in a run's episodes/ now."""
     return len(list((out / "episodes").glob("*.mcap")))
 
 
-def expected_attempts(num_episodes: int, *, seed: int = 0, max_attempts: int = 3) -> dict[tuple[int, int], bool]:
+def expected_attempts(num_episodes: int, *, seed: int = 0) -> dict[tuple[int, int], bool]:
     """Attempts that a run must make, by definition: an episode is attempted until an attempt succeeds."""
     expected = {}
     for episode in range(num_episodes):
-        for attempt in range(max_attempts):
+        for attempt in range(3):
             expected[episode, attempt] = succeeds(seed, episode, attempt)
             if expected[episode, attempt]:
                 break

@@ -63,7 +63,6 @@ def write_robomimic(path: Path, *, control_freq: float | None = 20.0, compressio
 
 
 def jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """Encode an image as a JPEG file."""
     stored = io.BytesIO()
     Image.fromarray(image).save(stored, "JPEG", quality=quality)
     return stored.getvalue()

@@ -40,7 +40,6 @@ class Layout:
     write: Callable[[Notes, Path], Path] = field(default=lambda notes, path: bags.write_rosbag2(notes, path / "bag"))
 
     def notes(self) -> Notes:
-        """Messages in the order of recording."""
         return bags.in_order([note for notes in self.topics for note in notes])
 
 

@@ -28,7 +28,6 @@ class Command:
 
 
 def plugin_names() -> list[str]:
-    """Names of the distributions in `plugins/`."""
     return [tomllib.loads(path.read_text())["project"]["name"] for path in PLUGINS]
 
 

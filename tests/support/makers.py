@@ -26,7 +26,6 @@ def succeeds(seed: int, episode: int, attempt: int) -> bool:
 
 
 def make(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Make a recording at once."""
     success = succeeds(plan.config.seed, plan.episode_index, plan.attempt)
     name = recording_name(plan.episode_index, plan.attempt, success=success)
     content = {
@@ -77,7 +76,6 @@ def die_once(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def die_always(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Die in every worker that gets episode 2."""
     if plan.episode_index == 2:
         os.kill(os.getpid(), signal.SIGKILL)
     return make(plan, folder)
@@ -139,7 +137,6 @@ def report_pid(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def line_of(path: Path, content: dict[str, object], file: str) -> Attempt:
-    """Line of run.json for a stand-in recording."""
     return Attempt(
         episode_index=int(str(content["episode_index"])),
         attempt=int(str(content["attempt"])),

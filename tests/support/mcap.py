@@ -19,18 +19,15 @@ MAGIC = b"\x89MCAP0\r\n"
 
 
 def record(opcode: int, content: bytes) -> bytes:
-    """Any record."""
     return struct.pack("<BQ", opcode, len(content)) + content
 
 
 def string(text: str) -> bytes:
-    """A string with its length."""
     data = text.encode(errors="surrogatepass")
     return struct.pack("<I", len(data)) + data
 
 
 def message_record(channel: int, time_ns: int, data: bytes) -> bytes:
-    """A message."""
     return record(5, struct.pack("<HIQQ", channel, 0, time_ns, time_ns) + data)
 
 
@@ -41,7 +38,6 @@ def chunk_record(packed: bytes, *, size: int, crc: int) -> bytes:
 
 
 def metadata_record(name: str, values: Mapping[str, str]) -> bytes:
-    """Metadata."""
     pairs = b"".join(string(key) + string(value) for key, value in values.items())
     return record(12, string(name) + struct.pack("<I", len(pairs)) + pairs)
 

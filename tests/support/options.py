@@ -33,7 +33,6 @@ class Option(NamedTuple):
 
     @property
     def is_pair(self) -> bool:
-        """Whether it takes two values."""
         return any(get_origin(kind) is tuple and Ellipsis not in get_args(kind) for kind in parts_of(self.type))
 
 

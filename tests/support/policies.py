@@ -13,8 +13,6 @@ from demorec.runs.run_file import Attempt
 
 
 class Lazy:
-    """A policy that never moves."""
-
     def __init__(self, *_: object, **__: object) -> None:
         pass
 

@@ -23,8 +23,6 @@ PATTERNS = {
 
 
 class OddSentence(NamedTuple):
-    """A sentence with signs."""
-
     path: Path
     signs: tuple[str, ...]
     sentence: str
@@ -50,7 +48,6 @@ def read(paths: Iterable[Path]) -> tuple[list[OddSentence], int]:
 
 
 def _python(source: str) -> Iterator[str]:
-    """Strings and comments."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.value
@@ -59,7 +56,6 @@ def _python(source: str) -> Iterator[str]:
 
 
 def _markdown(source: str) -> Iterator[str]:
-    """Paragraphs, items of lists and table cells, without code."""
     code = r"(?ms)^ *```.*?^ *```$|^(?: {4}|!\[|<)[^\n]*$"
     prose = re.sub(code, "", source)
     for block in re.finditer(r"(?s)\S.*?(?=\n\s*\n|\n\||\n *[-*] |\n *\d+\. |\Z)", prose):

@@ -112,7 +112,6 @@ def frame_number(image: NDArray[np.uint8]) -> int:
 
 
 def write_episode(path: Path, *, video: VideoConfig | None = None, **arguments: object) -> Path:
-    """Record `make_episode(**arguments)` at `path`."""
     info, frames, outcome = make_episode(**arguments)  # type: ignore[arg-type]
     with EpisodeWriter(path, info, video=video) as writer:
         for frame in frames:

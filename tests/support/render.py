@@ -22,7 +22,6 @@ DATA = pybullet_data.getDataPath()
 
 
 def connect() -> Any:
-    """Connect to an empty client."""
     client = BulletClient(pybullet.DIRECT)
     client.setAdditionalSearchPath(DATA)
     return client
@@ -90,7 +89,6 @@ def cast_sphere(radius: float, origin: Any, direction: Any, centre: Any = (0, 0,
 
 
 def cast_box(size: Any, origin: Any, direction: Any) -> NDArray[np.float64]:
-    """(H, W) depth of a box of full extents `size`."""
     half = np.asarray(size) / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         one, two = (-half - origin) / direction, (half - origin) / direction
@@ -188,5 +186,4 @@ def panda_cameras(width: int, height: int) -> tuple[SceneCamera, SceneCamera]:
 
 
 def panda_mounts(bodies: dict[str, Any]) -> dict[str, Mount]:
-    """Pose of the wrist camera."""
     return {"hand": Mount(body=bodies["panda"], link=8)}

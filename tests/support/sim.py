@@ -23,7 +23,6 @@ def first_frame(prepared: PreparedEpisode) -> Frame:
 
 
 def run(prepared: PreparedEpisode, world: World | None = None) -> tuple[list[Frame], Outcome]:
-    """All frames and the outcome, in `world` or in a new one."""
     if world is None:
         with make_world(prepared.info) as fresh:
             return run(prepared, fresh)

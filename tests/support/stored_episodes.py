@@ -42,7 +42,6 @@ class StoredEpisode:
 
 
 def task_texts(root: Path) -> dict[int, str]:
-    """Number -> text of each task."""
     if (path := root / "meta/tasks.parquet").exists():
         rows = pq.read_table(path).to_pylist()
     else:
@@ -142,5 +141,4 @@ def is_counted(episodes: list[StoredEpisode]) -> bool:
 
 
 def seconds(episode: StoredEpisode) -> np.ndarray[Any, Any]:
-    """Timestamps of an episode."""
     return np.array(episode.columns["timestamp"])

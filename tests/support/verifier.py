@@ -17,18 +17,15 @@ def never_end(pipe: Connection[Any, Any], cache: str) -> None:
 
 
 def never_listen(pipe: Connection[Any, Any], cache: str) -> None:
-    """Hang, and ignore signals."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     pipe.send("deaf")
     never_end(pipe, cache)
 
 
 def die(pipe: Connection[Any, Any], cache: str) -> None:
-    """Die as if killed by the system."""
     os._exit(3)
 
 
 def lack_memory(pipe: Connection[Any, Any], cache: str) -> None:
-    """Fail to allocate memory."""
     pipe.recv()
     pipe.send(resource_error(MemoryError()))

@@ -95,7 +95,6 @@ class Chromium:
         self._number = 0
 
     def call(self, method: str, **parameters: object) -> dict[str, Any]:
-        """Send a command of the protocol and return its result."""
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
@@ -106,7 +105,6 @@ class Chromium:
                 return result
 
     def value(self, expression: str) -> Any:
-        """Evaluate a JavaScript expression, awaiting promises."""
         answer = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
