@@ -21,7 +21,6 @@ from support.hdf5 import (
     images,
     jpeg,
     write_aloha,
-    write_groups_at_root,
     write_isaac,
     write_robomimic,
 )
@@ -397,19 +396,16 @@ def test_the_state_of_isaac_lab_is_the_absolute_one(tmp_path: Path) -> None:
             np.testing.assert_array_equal(table.features["observation.ee_pose"], pose)
 
 
-@pytest.mark.parametrize("layout", ["isaac", "aloha", "unknown"])
+@pytest.mark.parametrize("layout", ["isaac", "unknown"])
 def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "demo.hdf5"
-    if layout == "unknown":
+    if layout == "isaac":
+        write_isaac(path)
+    else:
         with h5py.File(path, "w") as file:
             file["log/values"] = np.zeros((3, 2))
-    else:
-        writers: dict[str, Callable[[Path], Path]]
-        writers = {"isaac": write_isaac, "aloha": write_aloha}
-        writers[layout](path)
     with h5py.File(path) as file:
-        first, count, rows = {"isaac": ("data/demo_0", 2, 12), "aloha": ("/", 1, 8),
-                              "unknown": ("/", None, 0)}[layout]  # fmt: skip
+        first, count, rows = ("data/demo_0", 2, 12) if layout == "isaac" else ("/", None, 0)
         expected: dict[str, list[int]] = {}
         file[first].visititems(
             lambda name, item: expected.update({name: list(item.shape)}) if isinstance(item, h5py.Dataset) else None
@@ -424,21 +420,18 @@ def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: 
     )
 
 
-@pytest.mark.parametrize(
-    ("action", "state", "demos"),
-    [
-        ("action", "observation", ("demo_0", "demo_2", "demo_10")),
-        ("actions", "obs", ("Trial 4", "ep-3", "x")),
-    ],
-)
-def test_episodes_that_are_groups_at_the_root(action: str, state: str, demos: tuple[str, ...], tmp_path: Path) -> None:
-    others = ("contact 2", "force", "tip/pose")
-    file = write_groups_at_root(tmp_path / "demo.hdf5", action=action, state=state, others=others, demos=demos)
+@pytest.mark.parametrize("demos", [("demo_0", "demo_2", "demo_10"), ("Trial 4", "ep-3", "x")])
+def test_episodes_that_are_groups_at_the_root(demos: tuple[str, ...], tmp_path: Path) -> None:
+    names = ("actions", "obs", "contact 2", "force", "tip/pose")
+    file, rng = tmp_path / "demo.hdf5", np.random.default_rng(3)
+    with h5py.File(file, "w") as made:
+        for place in (f"{demo}/{name}" for demo in demos for name in names):
+            made[place] = rng.normal(size=(5, 2 if "actions" in place else 4)).astype(np.float32)
     result, run = imported(file, changes={"# fps = 20 ": "fps = 20 "})
     assert result.num_episodes == len(demos)
     with h5py.File(file) as source:
         for demo, path in zip(demos, recordings(run), strict=True):
             with Recording(path) as recording:
                 held = {values.tobytes() for values in recording.table().features.values()}
-            for name in (action, state, *others):
+            for name in names:
                 assert source[f"{demo}/{name}"][:].tobytes() in held, name

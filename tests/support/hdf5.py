@@ -25,7 +25,7 @@ def images(count: int, seed: int) -> NDArray[np.uint8]:
     return shown
 
 
-def write_robomimic(path: Path, *, control_freq: float | None = 20.0, compression: str | None = None) -> Path:
+def write_robomimic(path: Path, *, compression: str | None = None) -> Path:
     """Write a processed robosuite dataset: data/demo_N with actions, rewards, dones, states, obs; masks; env_args.
 
     demo_10 takes the place of demo_2, so that names and numbers sort differently.
@@ -33,10 +33,8 @@ def write_robomimic(path: Path, *, control_freq: float | None = 20.0, compressio
     rng = np.random.default_rng(1)
     with h5py.File(path, "w") as file:
         data = file.create_group("data")
-        kwargs = {"robots": ["Panda"], "camera_names": ["agentview"]}
+        kwargs = {"robots": ["Panda"], "camera_names": ["agentview"], "control_freq": 20.0}
         described = {"env_name": "Lift", "type": 1, "env_kwargs": kwargs}
-        if control_freq is not None:
-            kwargs |= {"control_freq": control_freq}  # type: ignore[dict-item]
         data.attrs["env_args"] = json.dumps(described)
         data.attrs["total"] = sum(ROBOMIMIC_LENGTHS)
         for name, count in zip(("demo_0", "demo_1", "demo_10"), ROBOMIMIC_LENGTHS, strict=True):
@@ -120,23 +118,4 @@ def write_isaac(path: Path, *, robot: str = "robot") -> Path:
             demo["obs/eef_quat"] = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
             demo[f"states/articulation/{robot}/joint_position"] = absolute
             demo[f"states/articulation/{robot}/root_pose"] = rng.normal(size=(count, 7)).astype(np.float32)
-    return path
-
-
-def write_groups_at_root(
-    path: Path,
-    *,
-    action: str = "action",
-    state: str = "observation",
-    others: tuple[str, ...] = (),
-    count: int = 5,
-    demos: tuple[str, ...] = ("demo_0", "demo_2", "demo_10"),
-) -> Path:
-    """Write a file whose groups at the root are the episodes."""
-    rng = np.random.default_rng(3)
-    with h5py.File(path, "w") as file:
-        for name in demos:
-            file[f"{name}/{action}"] = rng.normal(size=(count, 2)).astype(np.float32)
-            for key in (state, *others):
-                file[f"{name}/{key}"] = rng.normal(size=(count, 4)).astype(np.float32)
     return path
