@@ -14,7 +14,6 @@ import pytest
 from support.check import (
     change_table,
     checked,
-    copy,
     edit_column,
     edit_json,
     edit_parquet,
@@ -50,7 +49,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def dataset(run: Path, tmp_path: Path) -> Path:
     """A copy to be damaged."""
-    return copy(run / "dataset", tmp_path / "dataset")
+    return shutil.copytree(run / "dataset", tmp_path / "dataset")
 
 
 def of_info(change: Callable[[Any], Any]) -> Fault:
@@ -246,7 +245,7 @@ def test_an_external_episode_that_was_changed(tmp_path: Path) -> None:
 
 def test_episodes_that_the_sidecar_does_not_know(run: Path, tmp_path: Path) -> None:
     """As after LeRobot's resume: episodes that the sidecar lists are compared with their own rows."""
-    spoilt = copy(run, tmp_path / "run")
+    spoilt = shutil.copytree(run, tmp_path / "run")
     path = next((spoilt / "dataset/demorec/episodes").glob("*/*.parquet"))
     pq.write_table(pq.read_table(path).slice(1), path)
     assert [episode.number for episode in CheckedDataset(spoilt / "dataset").described()] == [1, 2]
