@@ -305,6 +305,14 @@ def test_numbered_elements_of_different_counts_have_nothing_in_common(sound: Evi
     assert found(diagnose(replace(resting, roles=roles)), "frozen_state") == set()
 
 
+def test_attempts_that_were_written_as_one_episode(sound: Evidence) -> None:
+    """Nothing marks where one rollout ends (strands-labs/robots#708)."""
+    states = [each.state for each in sound.episodes[:6] if each.state is not None]
+    whole = episode(0, np.vstack(states), np.vstack(states))
+    assert found(diagnose(replace(sound, episodes=[whole], cameras={})), "joined_episodes") == {0}
+    assert found(diagnose(replace(sound, episodes=sound.episodes[:1], cameras={})), "joined_episodes") == set()
+
+
 def test_slow_motion_is_no_idle_end(sound: Evidence) -> None:
     """The arm moves on by less than a degree a frame, or its reading stays where it is."""
 

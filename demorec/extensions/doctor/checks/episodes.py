@@ -41,6 +41,10 @@ IDLE_TIMES = 4.0
 """Minimum factor over the usual idle time."""
 IDLE_RATIO = 0.02
 """Maximum distance of an element at rest from its position, as a ratio of its usual range."""
+MIN_RETURN = 0.08
+"""Minimum distance of an arm from its start, as a ratio of the range, before it jumps back."""
+MIN_LENGTH_TIMES = 3.0
+"""Minimum factor over the usual length at which an episode contains several."""
 _PLACEHOLDERS = frozenset(("", "none", "null", "nan", "task", "todo", "test", "unknown", "n/a", "default"))
 MIN_COMMON = 5
 """Minimum number of episodes with the common instruction for a single other one to be questioned."""
@@ -108,6 +112,43 @@ def _arm_speed(evidence: Evidence, state: Array) -> Array:
     floor = MIN_SPAN * ranges.max(initial=0.0)
     steps = np.diff(state[:, arm], axis=0) if floor > 0 else np.zeros((len(state) - 1, 1))
     return np.asarray(np.linalg.norm(steps / np.maximum(ranges, floor or 1.0), axis=1))
+
+
+@check(
+    family="set",
+    needs="state, eight episodes",
+    measures="episodes that contain several",
+    unit="times the length",
+    why="Nothing marks where one attempt ends and the next begins: the policy learns to start over.",
+    do="split it where the arm returns to its start, in the program that recorded it, or drop it: " + DROP,
+)
+def joined_episodes(evidence: Evidence) -> Iterator[Fault]:
+    """Find episodes several times as long as the others that repeatedly return to their start."""
+    episodes = evidence.need_state(8)
+    lengths = [len(state) for _, state in episodes]
+    length, _ = usual(lengths)
+    for episode, state in episodes:
+        returns = _returns(evidence, state)
+        is_long = len(episodes) > MIN_OTHERS and len(state) > MIN_LENGTH_TIMES * length
+        if returns >= 2 and (is_long or len(episodes) == 1):
+            yield Fault(
+                severity="broken" if is_long else "look",
+                episode=episode.number,
+                value=f"{len(state) / length:.1f} times" if is_long else f"{returns + 1} attempts",
+                message=f"it seems to contain {returns + 1} episodes: it jumps back to its start {returns} times",
+            )
+
+
+def _returns(evidence: Evidence, state: Array) -> int:
+    """Count how often the arm returns to its first position within one frame, at rest before and after."""
+    span = np.ptp(state, axis=0)
+    alive = (span > 0) & ~evidence.is_gripper
+    if not alive.any():
+        return 0
+    away = (np.abs((state - state[0])[:, alive]) / span[alive]).max(axis=1)
+    steps = (np.abs(np.diff(state[:, alive], axis=0)) / span[alive]).max(axis=1)
+    is_jump = (steps[1:-1] > MIN_RETURN) & (np.maximum(steps[:-2], steps[2:]) < 0.3 * steps[1:-1])
+    return int((is_jump & (away[2:-1] < MIN_RETURN / 2)).sum())
 
 
 @check(
