@@ -133,4 +133,4 @@ def test_a_run_is_recognised_and_checked(external_run: Path, capsys: pytest.Capt
     plain = json.loads(told)
     assert (plain["kind"], plain["frames"], plain["robot"]) == ("external recording", 20, "two_joints")
     code, told = run(capsys, "info", external_run / "episodes")
-    assert (code, told.count("(external)")) == (0, 2)
+    assert (code, told.count("external, format")) == (0, 2)
