@@ -310,6 +310,7 @@ def test_an_unwritable_target_is_exit_code_2(
 ) -> None:
     """Tests of options have names that are too long, not UTF-8 or below a file."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "lerobot", None)  # as some programs do; undone after the test
     Path("link").symlink_to("nothing")
     call = ROWS[name].call.replace("SOURCES", str(sources))
     for place in ("/proc/new", "link/new"):
