@@ -75,15 +75,7 @@ def import_lerobot(
     numbers = sorted(set(select_episodes(range(len(dataset.places)), episodes)))
     chosen = [(number, dataset.places[number]) for number in numbers]
     survey = _surveyed(dataset, [place for _, place in chosen], noted)
-    unkept = dict.fromkeys(survey.inexact, "it has whole numbers that float64 cannot hold")
-    unkept |= {
-        name: "it may refer to tasks by number, and an export of the run numbers them again"
-        for name, feature in dataset.info.features.items()
-        if is_task_reference(name, feature)
-    }
-    for name in unkept:
-        dataset.leave_out(name)
-    left_out |= unkept
+    left_out |= _leave_out_unkept(dataset, survey)
     cameras, fates = _cameras(dataset, survey)
     digest, num_new, num_frames = functools.cache(sha256_of), 0, 0
     with open_external_run(out, recovers=False) as folder:
@@ -107,6 +99,19 @@ def import_lerobot(
         skipped={f"episode {index}": reason for index, reason in skipped.items()},
         notes=(*dataset.notes, *_rounded(dataset)),
     )
+
+
+def _leave_out_unkept(dataset: LeRobotFolder, survey: _Survey) -> dict[str, str]:
+    """Leave out features whose values a recording or its export would not keep; returns each with the reason."""
+    unkept = dict.fromkeys(survey.inexact, "it has whole numbers that float64 cannot hold")
+    unkept |= {
+        name: "it may refer to tasks by number, and an export of the run numbers them again"
+        for name, feature in dataset.info.features.items()
+        if is_task_reference(name, feature)
+    }
+    for name in unkept:
+        dataset.leave_out(name)
+    return unkept
 
 
 def _opened(roots: Sequence[Path], motors: Motors | None, named: NamedRoles) -> LeRobotFolder:

@@ -52,12 +52,13 @@ def time_gaps(evidence: Evidence) -> Iterator[Fault]:
             continue
         gaps = np.flatnonzero(steps * evidence.fps > MAX_GAP_PERIODS)
         if len(gaps):
-            moving = np.array([gap for gap in gaps if not _rests(evidence, episode, int(gap))], dtype=np.intp)
+            motion = _motion(evidence, episode)
+            moving = np.array([gap for gap in gaps if not _rests(motion, int(gap))], dtype=np.intp)
             judged = moving if len(moving) else gaps
             longest = int(judged[np.argmax(steps[judged])])
             more = f", and {len(gaps) - 1} more gaps" if len(gaps) > 1 else ""
             seconds = float(steps[longest])
-            moves_on = len(moving) > 0 and _moves_on(evidence, episode, longest, seconds * evidence.fps)
+            moves_on = len(moving) > 0 and _moves_on(motion, longest, seconds * evidence.fps)
             what = "the state moves on as usual, but its clock jumps by {} s" if moves_on else "{} s pass"
             yield Fault(
                 severity="broken" if len(moving) else "look",
@@ -69,26 +70,29 @@ def time_gaps(evidence: Evidence) -> Iterator[Fault]:
             )
 
 
-def _rests(evidence: Evidence, episode: EpisodeEvidence, frame: int) -> bool:
-    """Check whether the arm is known to rest before, during, and after a gap."""
-    at, around = _steps(evidence, episode, frame)
-    return max(at, around) <= MAX_REST
-
-
-def _moves_on(evidence: Evidence, episode: EpisodeEvidence, frame: int, periods: float) -> bool:
-    """Check whether the state after a gap, at a known frame, is where it would be one frame later."""
-    at, around = _steps(evidence, episode, frame)
-    return at < around * periods / 4
-
-
-def _steps(evidence: Evidence, episode: EpisodeEvidence, frame: int) -> tuple[float, float]:
-    """Compute the step of the state across a gap and the median of those around it, in ranges; inf if unknown."""
+def _motion(evidence: Evidence, episode: EpisodeEvidence) -> Array | None:
+    """Compute the (T - 1,) largest step of the state's elements, in their usual ranges; None if unknown."""
     if episode.state is None:
-        return np.inf, np.inf
+        return None
     alive = evidence.ranges > MIN_SPAN * evidence.ranges.max(initial=0.0)
-    steps = (np.abs(np.diff(episode.state[:, alive], axis=0)) / evidence.ranges[alive]).max(axis=1, initial=0.0)
-    around = np.delete(steps[max(frame - NEIGHBOURS, 0) : frame + NEIGHBOURS + 1], min(frame, NEIGHBOURS))
-    return float(steps[frame]), float(np.median(around))
+    steps = np.abs(np.diff(episode.state[:, alive], axis=0)) / evidence.ranges[alive]
+    return np.asarray(steps.max(axis=1, initial=0.0))
+
+
+def _around(motion: Array, frame: int) -> float:
+    """Compute the median step of the frames around a gap."""
+    around = motion[max(frame - NEIGHBOURS, 0) : frame + NEIGHBOURS + 1]
+    return float(np.median(np.delete(around, min(frame, NEIGHBOURS))))
+
+
+def _rests(motion: Array | None, frame: int) -> bool:
+    """Check whether the arm is known to rest before, during, and after a gap."""
+    return motion is not None and max(float(motion[frame]), _around(motion, frame)) <= MAX_REST
+
+
+def _moves_on(motion: Array | None, frame: int, periods: float) -> bool:
+    """Check whether the state after a gap, at a known frame, is where it would be one frame later."""
+    return motion is not None and bool(motion[frame] < _around(motion, frame) * periods / 4)
 
 
 def _is_of_other_rate(steps: Array, fps: float) -> bool:
