@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -134,14 +135,14 @@ class CheckCommand:
         )
         found: list[Diagnosis] = []
         read: list[Evidence] = []
-        with ProgressBar("reading", total=len(self.paths), unit="item") as bar:
-            for path in self.paths:
+        with ProgressBar("reading", total=len(self.paths), unit="part") as bar:
+            for number, path in enumerate(self.paths, start=1):
                 own = [report for report in reports if report.path == path or path in report.path.parents]
-                diagnosis, evidence = examine(path, options, reports=own, checks=checks, earlier=tuple(read))
+                shown = replace(options, progress=partial(_advance, bar, bar.done, len(self.paths) - number))
+                diagnosis, evidence = examine(path, shown, reports=own, checks=checks, earlier=tuple(read))
                 if evidence is not None and len(self.paths) > 1:
                     read.append(evidence.without_images())
                 found.append(diagnosis)
-                bar.advance()
                 if not self.json:
                     say(*lines_of(diagnosis, everything=self.all))
         return found
@@ -183,6 +184,11 @@ class CheckCommand:
                 if not self.json:
                     say(*deep_lines(report, verbose=self.all))
                 yield report
+
+
+def _advance(bar: ProgressBar, before: int, paths_left: int, done: int, total: int) -> None:
+    """Show the parts of one path after those of the paths before it; each path left has at least one part."""
+    bar.set(before + done, before + total + paths_left)
 
 
 def deep_lines(report: DeepReport, *, verbose: bool = False) -> Iterator[str]:

@@ -86,7 +86,7 @@ def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen:
     """Add the findings about the files of a run's own dataset; its numbers and images are those of the recordings."""
     from demorec.core.errors import ExportError
     from demorec.extensions.doctor.diagnosis import diagnose
-    from demorec.extensions.doctor.from_dataset import evidence_of_dataset
+    from demorec.extensions.doctor.from_dataset import evidence_of_dataset, no_progress
     from demorec.runs.find import find
     from demorec.runs.run_file import DATASET
 
@@ -94,7 +94,7 @@ def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen:
     if find(path).kind != "dataset":
         return diagnosis
     try:
-        evidence = evidence_of_dataset(path, replace(options, images=False))
+        evidence = evidence_of_dataset(path, replace(options, images=False, progress=no_progress))
     except ExportError as error:
         return replace(diagnosis, findings=(_unopened(error, path), *diagnosis.findings))
     if options.images:

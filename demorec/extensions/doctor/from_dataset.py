@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -26,6 +26,10 @@ from demorec.robots.motors import Motors
 from demorec.runs.find import find
 
 
+def no_progress(done: int, total: int) -> None:
+    """Report nothing."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
     """Options for reading evidence.
@@ -36,6 +40,7 @@ class ReadOptions:
         motors: Servos that state and action belong to, if given by the user.
         urdf: Text of the robot's description given by the user, "" for none.
         lerobot: Whether to open the dataset with the installed LeRobot.
+        progress: Called with the number of parts read, and of all parts.
     """
 
     images: bool = True
@@ -43,6 +48,21 @@ class ReadOptions:
     motors: Motors | None = None
     urdf: str = ""
     lerobot: bool = False
+    progress: Callable[[int, int], None] = no_progress
+
+
+@dataclass(kw_only=True)
+class PartCounter:
+    """Counter of the parts that have been read: an episode's rows, or its images of one camera."""
+
+    total: int
+    progress: Callable[[int, int], None]
+    done: int = 0
+
+    def advance(self) -> None:
+        """Count one more part."""
+        self.done += 1
+        self.progress(self.done, self.total)
 
 
 def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
@@ -65,7 +85,10 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
     joints = _joints(robot, folder, elements)
     in_si = robot is not None and not options.urdf
     reader = folder.rows([name for name in folder.columns if folder.info.features[name].dtype != "image"])
+    cameras = _camera_names(folder) if options.images else []
+    parts = PartCounter(total=len(folder.listed) * (1 + len(cameras)), progress=options.progress)
     for place in folder.listed:
+        parts.advance()
         problems: list[str] = []
         columns: Mapping[str, NDArray[Any]] = {}
         with noted(problems, root):
@@ -92,7 +115,7 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
         episodes=readable,
         unreadable=unreadable,
         folder=folder,
-        cameras=_cameras(folder, unreadable) if options.images else {},
+        cameras=_cameras(folder, cameras, unreadable, parts),
         images_missing=_why_no_images(folder) if options.images else "images are not decoded (--no-images)",
         urdf=options.urdf or ("" if robot is None else robot.urdf),
         robot_problem="; ".join(robot_problems),
@@ -157,24 +180,37 @@ def _why_no_images(folder: LeRobotFolder) -> str:
     return ""
 
 
-def _cameras(folder: LeRobotFolder, unreadable: Collection[int]) -> dict[str, CameraThumbnails]:
+def _camera_names(folder: LeRobotFolder) -> list[str]:
+    """List the colour cameras of which at least one file is here."""
+    return [
+        key
+        for key, feature in folder.info.features.items()
+        if feature.is_camera and not feature.is_depth and not (feature.is_video and _is_absent(folder, key))
+    ]
+
+
+def _cameras(
+    folder: LeRobotFolder, keys: Sequence[str], unreadable: Collection[int], parts: PartCounter
+) -> dict[str, CameraThumbnails]:
     found = {}
-    for key, feature in folder.info.features.items():
-        if feature.is_depth or not feature.is_camera or (feature.is_video and _is_absent(folder, key)):
-            continue
+    for key in keys:
         episodes: dict[int, EpisodeThumbnails] = {}
         errors: dict[int, str] = {}
-        if feature.is_video:
-            _read_videos(folder, key, episodes, errors)
+        if folder.info.features[key].is_video:
+            _read_videos(folder, key, episodes, errors, parts)
         else:
-            _read_stored(folder, key, unreadable, episodes, errors)
+            _read_stored(folder, key, unreadable, episodes, errors, parts)
         if episodes or errors:
             found[key] = CameraThumbnails(episodes=episodes, errors=errors)
     return found
 
 
 def _read_videos(
-    folder: LeRobotFolder, key: str, episodes: dict[int, EpisodeThumbnails], errors: dict[int, str]
+    folder: LeRobotFolder,
+    key: str,
+    episodes: dict[int, EpisodeThumbnails],
+    errors: dict[int, str],
+    parts: PartCounter,
 ) -> None:
     """Decode a camera's videos, each file in one pass."""
     shrinker = Shrinker()
@@ -183,6 +219,7 @@ def _read_videos(
         problems: list[str] = []
         with noted(problems, folder.root), opened_video(path) as opened:
             for place in places:
+                parts.advance()
                 own: list[str] = []
                 with noted(own, folder.root):
                     episodes[place.episode_index] = shrinker.shrink(folder.video(key, place).decoded(opened=opened))
@@ -198,9 +235,11 @@ def _read_stored(
     unreadable: Collection[int],
     episodes: dict[int, EpisodeThumbnails],
     errors: dict[int, str],
+    parts: PartCounter,
 ) -> None:
     shrinker = Shrinker()
     for place in (place for place in folder.listed if place.episode_index not in unreadable):
+        parts.advance()
         problems: list[str] = []
         with noted(problems, folder.root):
             episodes[place.episode_index] = shrinker.shrink(frames_of(folder.stored_images[key].read(place)))

@@ -41,6 +41,7 @@ def evidence_of_recordings(path: Path, files: Sequence[Path], options: ReadOptio
     roles: Roles | None = None
     urdf = options.urdf
     for number, file in enumerate(files):
+        options.progress(number + 1, len(files))
         try:
             with open_recording(file) as recording:
                 own = roles_of_recording(recording.info, options.named)

@@ -42,21 +42,22 @@ def wrong_statistics(evidence: Evidence) -> Iterator[Fault]:
     if not folder.info.is_old and not (evidence.path / STATS_PATH).exists():
         yield Fault(severity="broken", message=f"{STATS_PATH} is missing")
         return
-    missing: dict[tuple[Severity, int | None, str, str], list[str]] = {}
+    groups: dict[tuple[bool, Severity, int | None, str, str], list[StatisticError]] = {}
     for error in statistic_errors(folder, {each.number: each.columns for each in evidence.episodes}):
-        if math.isfinite(error.error):
-            yield Fault(
-                severity=_severity(error),
-                episode=error.episode,
-                value=f"{error.error:.2g} deviations",
-                message=f"the {error.quantity} of {error.feature} in {error.place} does not match the rows",
-            )
-        else:
-            place = (_severity(error), error.episode, error.quantity, error.place)
-            missing.setdefault(place, []).append(error.feature)
-    for (severity, episode, quantity, file), features in missing.items():
-        message = f"the {quantity} of {', '.join(features)} in {file} is missing"
-        yield Fault(severity=severity, episode=episode, value="missing", message=message)
+        is_missing = math.isinf(error.error)
+        key = (is_missing, _severity(error), error.episode, error.quantity, error.place)
+        groups.setdefault(key, []).append(error)
+    for (is_missing, severity, episode, quantity, file), errors in groups.items():
+        features = ", ".join(error.feature for error in errors)
+        largest = max(error.error for error in errors)
+        unit = "rows" if quantity == "count" else "deviations"
+        yield Fault(
+            severity=severity,
+            episode=episode,
+            value="missing" if is_missing else f"{largest:.2g} {unit}",
+            message=f"the {quantity} of {features} in {file} "
+            + ("is missing" if is_missing else "does not match the rows"),
+        )
     if folder.info.is_old:
         return  # training aggregates the episodes' statistics
     if evidence.unreadable:
