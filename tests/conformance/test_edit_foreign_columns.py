@@ -26,6 +26,7 @@ from support.stored_episodes import task_texts
 
 from demorec.datasets.lerobot.episode_places import are_on_grid
 from demorec.mcap import Recording
+from demorec.view.sources import find_episodes
 
 TEXTS = ("open the drawer", "close the drawer", "valid", "invalid", "push it")
 LENGTH, COUNT = 8, 4
@@ -111,7 +112,7 @@ def measured(jitter_s: float, start_s: float) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize(("jitter_s", "start_s"), [(0.004, 0.0), (0.02, 1.7)])
-def test_measured_timestamps_are_imported_as_stamps(
+def test_measured_timestamps_are_imported_and_shown(
     jitter_s: float, start_s: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seconds = measured(jitter_s, start_s)
@@ -121,6 +122,27 @@ def test_measured_timestamps_are_imported_as_stamps(
         with Recording(path) as recording:
             assert recording.time_ns.tolist() == np.rint(stamps.astype(np.float64) * 1e9).astype(np.int64).tolist()
     assert exit_code("view", source, "--episodes", "0", "--save", tmp_path / "x.rrd") == 0
+    for playback, stamps in zip(find_episodes([source]), seconds.reshape(COUNT, LENGTH).astype(float), strict=True):
+        with playback.open() as episode:
+            shown = episode.data.time_ns / 1e9
+        np.testing.assert_allclose(shown - shown[0], stamps - stamps[0], atol=1e-8)
+
+
+def test_a_cut_keeps_the_stages_within_it(tmp_path: Path) -> None:
+    source = foreign(tmp_path / "d", {})
+    stages = {
+        "names": ["reach", "grasp", "lift"], "start_frames": [0, 3, 6], "end_frames": [2, 5, 7],
+        "start_times": [0.0, 0.3, 0.6], "end_times": [0.3, 0.6, 0.8],
+    }  # fmt: skip
+    table = pq.read_table(source / EPISODES)
+    for name, values in stages.items():
+        table = table.append_column(f"sparse_subtask_{name}", pa.array([values] * COUNT))
+    pq.write_table(table, source / EPISODES)
+    assert exit_code("dataset", "trim", source, "--head", 4, "--tail", 1, "--out", tmp_path / "new") == 0
+    row = pq.read_table(tmp_path / "new" / EPISODES).to_pylist()[1]
+    found = [row[f"sparse_subtask_{name}"] for name in stages]
+    assert found[:3] == [["grasp", "lift"], [0, 2], [1, 2]]
+    np.testing.assert_allclose(found[3:], [[0, 0.2], [0.2, 0.3]], atol=1e-9)
 
 
 @pytest.mark.parametrize("begin_s", [0.0, 10.0, 1500.0, 3000.0])

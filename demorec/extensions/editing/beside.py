@@ -52,11 +52,11 @@ def _poses_are_kept(plan: Plan) -> bool:
 
 
 def has_progress(plan: Plan) -> bool:
-    """Whether all sources have demorec's stages of their whole episodes, from which new progress is computed."""
+    """Whether all sources have progress and demorec's stages, from which that of the new dataset is computed."""
     needed = {*STAGE_COLUMNS, "num_goals"}
     have_stages = all(needed <= set(source.fact_types) for source in plan.sources)
     has_files = all((source.root / PROGRESS_PATH).is_file() for source in plan.sources)
-    return have_stages and has_files and all(map(plan.is_whole, plan.cuts))
+    return have_stages and has_files
 
 
 class SidecarReader:

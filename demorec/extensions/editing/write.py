@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Mapping
-from itertools import islice
+from itertools import compress, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from PIL import Image
 from demorec.core.errors import ExportError
 from demorec.core.files import open_regular
 from demorec.datasets.lerobot.episode_places import EpisodePlace, are_on_grid
-from demorec.datasets.lerobot.facts import STAGE_COLUMNS, write_progress
+from demorec.datasets.lerobot.facts import write_progress
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_statistics
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 _NUMBERS = tuple(name for name in NAMES if name != "count")
 _EPISODES_AT_ONCE = 64
+_STAGE_PARTS = ("names", "start_frames", "end_frames", "start_times", "end_times")
 _OF_THE_END = ("next.done", "next.success", "next.reward")
 
 
@@ -246,7 +247,24 @@ class _Reader:
             facts["duration_s"] = (cut.last - cut.first) / self._fps
         if "success" in facts and not cut.has_end:
             facts["success"] = None
-        return facts if self._plan.is_whole(cut) else facts | dict.fromkeys(STAGE_COLUMNS)
+        return facts if self._plan.is_whole(cut) else facts | _cut_stages(facts, cut, self._fps)
+
+
+def _cut_stages(facts: Mapping[str, Any], cut: EpisodeSlice, fps: int) -> dict[str, Any]:
+    """Stages as LeRobot's SARM annotates them, within a cut, with frames and seconds counted from its first frame."""
+    found: dict[str, Any] = {}
+    for stem in (name.removesuffix("names") for name in facts if name.endswith("subtask_names")):
+        columns = {name: facts[name] for part in _STAGE_PARTS if facts.get(name := f"{stem}{part}")}
+        edges = zip(columns.get(f"{stem}start_frames", ()), columns.get(f"{stem}end_frames", ()), strict=False)
+        inside = [first < cut.last and last >= cut.first for first, last in edges]
+        for name, values in columns.items() if inside else ():
+            kept = list(compress(values, inside))
+            if name.endswith("_frames"):
+                kept = [min(max(frame, cut.first), cut.last - 1) - cut.first for frame in kept]
+            elif name.endswith("_times"):
+                kept = [min(max(time, cut.first / fps), cut.last / fps) - cut.first / fps for time in kept]
+            found[name] = kept
+    return found
 
 
 def _with_end(kept: pa.Array, column: pa.Array) -> pa.Array:
