@@ -119,6 +119,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "more episodes than rows": (
         column("meta/episodes", "episode_index", lambda values: [*values[:-1], 9]), "entries of 3, 9 are"),
     "wrong counts": (info(total_episodes=9, total_frames="many", total_tasks=0), "total_frames many; it is 54 now"),
+    "impossible splits": (info(splits={"train": "0:900"}), "states the splits {'train': '0:900'}; train has all"),
     "wrong sizes": (info(chunks_size=0, data_files_size_in_mb=None), "chunks_size 0"),
     "stale files (lerobot#2401)": (column("meta/episodes", "data/file_index", lambda v: [0] * len(v)), "entries of"),
     "scrambled ranges (lerobot#1919)": (
@@ -199,6 +200,21 @@ def test_names_keep_their_form(
     assert ("The names of observation.state are left out" in capsys.readouterr().out) != fits
     found = json.loads((tmp_path / "new/meta/info.json").read_text())["features"]["observation.state"]
     assert (found["dtype"], found["shape"], found["names"]) == ("float64", [3], names if fits else None)
+
+
+def test_splits_are_kept_where_episodes_keep_their_numbers(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    splits, text = {"train": "0:2", "val": "2:4"}, "info.json states the splits"
+    for name, is_cut_off in (("a", False), ("b", True)):
+        root = Path(shutil.copytree(whole, tmp_path / name))
+        info(splits=splits, total_tasks=0)(root)
+        if is_cut_off:
+            cut_off(sorted(root.glob("data/*/*.parquet"))[0])
+        assert repair(root, "--out", tmp_path / f"new_{name}") == 0
+        assert (text in capsys.readouterr().out) == is_cut_off
+        found = json.loads((tmp_path / f"new_{name}/meta/info.json").read_text())
+        assert found["splits"] == ({"train": f"0:{found['total_episodes']}"} if is_cut_off else splits)
 
 
 @pytest.mark.parametrize("place", ["data", f"videos/{TOP}"])

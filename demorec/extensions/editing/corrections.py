@@ -213,6 +213,8 @@ def table_changes(
     for name, count in counts.items():
         if stated.get(name) != count:
             yield f"info.json states {name} {stated.get(name)}; it is {count} now."
+    if not kept_splits(folder, stated):
+        yield f"info.json states the splits {stated.get('splits')}; train has all episodes now."
     if not folder.info.is_old or (folder.root / OLD_STATS).exists():
         yield from _statistics(folder)
 
@@ -225,6 +227,19 @@ def _wrong_entries(folder: LeRobotFolder, stored: Mapping[int, EpisodePlace]) ->
         if entry is None or replace(entry, tasks=place.tasks) != place or not set(place.tasks) <= set(entry.tasks):
             wrong.add(place.episode_index)
     return wrong | set(stored) - {place.episode_index for place in folder.listed}
+
+
+def kept_splits(folder: LeRobotFolder, stated: Mapping[str, Any]) -> dict[str, str]:
+    """Return the splits of info.json if they are disjoint ranges of the episodes, which keep their numbers; else {}."""
+    try:
+        splits = {str(name): str(text) for name, text in stated["splits"].items()}
+        ranges = sorted(tuple(map(int, text.split(":"))) for text in splits.values())
+    except (KeyError, AttributeError, ValueError):
+        return {}
+    count, ends = len(folder.listed), [0, *(end for each in ranges for end in each)]
+    is_numbered = [place.episode_index for place in folder.listed] == list(range(count))
+    is_possible = all(len(each) == 2 for each in ranges) and ends == sorted(ends) and ends[-1] <= count
+    return splits if is_numbered and is_possible else {}
 
 
 def _tasks(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Iterator[str]:

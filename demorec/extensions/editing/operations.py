@@ -200,11 +200,13 @@ class Repair(EditOne):
         return bool(sources[0].notes)
 
     def edited(self, plan: Plan) -> Plan:
-        """All episodes with readable rows and images, and with the instructions that their rows lack."""
+        """All episodes with readable rows and images, with the instructions that their rows lack, and the splits."""
         from demorec.extensions.editing.repair import RepairedDataset
 
         (source,) = plan.sources
         assert isinstance(source, RepairedDataset)
+        if source.splits:
+            plan = replace(plan, info=replace(plan.info, other={**plan.info.other, "splits": source.splits}))
         return plan.with_cuts([replace(cut, task=source.instructions.get(cut.episode, "")) for cut in plan.cuts])
 
 

@@ -32,6 +32,7 @@ from demorec.datasets.lerobot.paths import is_dataset_file
 from demorec.datasets.lerobot.rows import DataRows
 from demorec.extensions.editing.corrections import (
     Repaired,
+    kept_splits,
     repaired_cameras,
     repaired_features,
     repaired_rate,
@@ -52,6 +53,7 @@ class RepairedDataset(LeRobotFolder):
     Attributes:
         changes: A sentence for each difference from tables and info.json.
         instructions: Number of an episode -> its instruction, if its rows do not refer to one.
+        splits: Those of info.json, empty if they do not fit the episodes.
 
     Raises:
         ExportError: Data would have to be invented.
@@ -79,6 +81,7 @@ class RepairedDataset(LeRobotFolder):
         self.listed = self.places = placed(kept, images, self.tasks)
         self._check_timestamps()
         self.changes += table_changes(self, stated, stored)
+        self.splits = kept_splits(self, stated)
 
     def _correct_info(self, repaired: Repaired) -> None:
         self.info, changes = repaired
