@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,29 @@ def test_topics_types_counts_rates_and_span(
     printed = capsys.readouterr().out
     for topic, (type_name, count) in expected.items():
         assert any(line.split()[:2] == [topic, str(count)] and type_name in line for line in printed.splitlines())
+
+
+def test_a_truncated_bag_is_listed_up_to_its_end(
+    notes: bags.Notes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = bags.write_mcap(notes, tmp_path / "x.mcap", chunk_size=10_000)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert exit_code("info", path, "--json") == 0
+    plain = json.loads(capsys.readouterr().out)
+    assert 0 < plain["messages"] < len(notes)
+    assert plain["problems"]
+
+
+def test_messages_without_a_log_time_are_not_in_the_length(
+    notes: bags.Notes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    times = [note.log_ns for note in notes[2:]]
+    path = bags.write_mcap([replace(note, log_ns=0) for note in notes[:2]] + notes[2:], tmp_path / "x.mcap")
+    assert exit_code("info", path, "--json") == 0
+    plain = json.loads(capsys.readouterr().out)
+    assert plain["seconds"] == pytest.approx((max(times) - min(times)) / 1e9)
+    assert plain["messages"] == len(notes)
+    assert any(f"{notes[0].topic}: messages without a log time" in problem for problem in plain["problems"])
 
 
 @pytest.mark.parametrize("command", ["info", "check", "view", "import"])

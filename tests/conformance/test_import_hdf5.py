@@ -250,6 +250,10 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
         lambda file: file["data/demo_1/obs/object"].__setitem__(3, float("nan")),
         "data/demo_1/obs/object is nan in row 3 (object_0)",
     ),
+    "whole numbers": (
+        _replaced("actions", lambda group, name: group.__setitem__(name, np.full((5, 7), 2**53 + 1))),
+        "whole numbers that float64 cannot hold",
+    ),
     "texts": (_replaced("actions", lambda group, name: group.__setitem__(name, ["a"] * 5)), "it holds objects"),
     "unwritten": (
         _replaced("actions", lambda group, name: group.create_dataset(name, (5, 7), "f8")), "not all of its rows"
@@ -389,11 +393,12 @@ def test_the_state_of_isaac_lab_is_the_absolute_one(tmp_path: Path) -> None:
             relative = source[f"data/{demo}/obs/joint_pos"][:]
             assert np.abs(absolute - relative).max() > 0.1
             with Recording(path) as recording:
-                table = recording.table()
+                table, names = recording.table(), {feature.name: feature.names for feature in recording.info.features}
             np.testing.assert_array_equal(table.features["observation.state"], absolute)
             np.testing.assert_array_equal(table.features["observation.joint_pos"], relative)
             pose = np.hstack([source[f"data/{demo}/obs/{name}"][:] for name in ("eef_pos", "eef_quat")])
             np.testing.assert_array_equal(table.features["observation.ee_pose"], pose)
+            assert [name[-2:] for name in names["observation.ee_pose"][3:]] == ["qw", "qx", "qy", "qz"]
 
 
 @pytest.mark.parametrize("layout", ["isaac", "unknown"])

@@ -259,21 +259,26 @@ class TopicSummary:
     Attributes:
         type: Type of the messages, as the bag names it.
         count: Number of messages.
-        first_ns, last_ns: Earliest and latest log time.
+        first_ns, last_ns: Earliest and latest log time above 0.
+        num_at_0: Number of messages with log time 0.
     """
 
     type: str
     count: int = 0
     first_ns: int = MAX_TIME_NS
     last_ns: int = 0
+    num_at_0: int = 0
 
     @property
     def rate_hz(self) -> float:
         """Mean rate by log times; 0 for fewer than two messages."""
         span_s = (self.last_ns - self.first_ns) / NS
-        return (self.count - 1) / span_s if span_s > 0 else 0.0
+        return (self.count - self.num_at_0 - 1) / span_s if span_s > 0 else 0.0
 
     def add(self, time_ns: int) -> None:
         """Count a message with this log time."""
         self.count += 1
-        self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
+        if time_ns == 0:
+            self.num_at_0 += 1
+        else:
+            self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)

@@ -11,6 +11,8 @@ from demorec.extensions.imports.import_file import load_import_file
 
 _MOST_PROBLEMS = 5
 """Maximum problems listed for a bag or file."""
+_EPOCH_NS = 10**17
+"""Times beyond it (1973) are of the Unix epoch, not of a simulation."""
 
 
 def describe_bags(path: Path) -> tuple[dict[str, Any], list[str]]:
@@ -35,6 +37,11 @@ def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
         topic.add(message.log_ns)
     last_ns = max((topic.last_ns for topic in topics.values()), default=0)
     first_ns = min([last_ns, *(topic.first_ns for topic in topics.values())])
+    at_0 = {name: topic.num_at_0 for name, topic in sorted(topics.items()) if topic.num_at_0}
+    if first_ns > _EPOCH_NS:
+        problems += [f"{name}: messages without a log time, left out of the length: {n}" for name, n in at_0.items()]
+    elif at_0:  # simulated time begins at 0
+        first_ns = 0
     seconds, count = (last_ns - first_ns) / NS, sum(topic.count for topic in topics.values())
     facts = [
         ("bag", f"{path} ({size_in_words(bag.num_bytes)})"),

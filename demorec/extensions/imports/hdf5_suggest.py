@@ -24,6 +24,11 @@ from demorec.runs.find import expect
 
 _ARTICULATION = re.compile(r"states/articulation/[^/]+/joint_position")
 """Absolute joint positions of Isaac Lab; its observation joint_pos is relative to the default pose."""
+_ISAAC_NAMES = (
+    (4, re.compile(r"(^|_)(quat|orientation)$"), ("qw", "qx", "qy", "qz")),
+    (7, re.compile(r"(^|/)root_pose$"), ("x", "y", "z", "qw", "qx", "qy", "qz")),
+)
+"""Number and names of the elements of Isaac Lab's orientations and poses, by the dataset's name."""
 _MAX_SHOWN = 4
 """Maximum entries of a file that an error lists."""
 _ALOHA_FPS = 50
@@ -236,6 +241,9 @@ def _features(contents: _Contents, layout: _Layout) -> Iterator[str]:
         key = feature if "." not in feature else quoted(feature)
         for name in observed[feature]:
             yield from ("", f"[[features.{key}]]", f"dataset = {quoted(name)}")
+            for count, ending, names in _ISAAC_NAMES if absolute else ():
+                if contents.arrays[name].shape[1:] == (count,) and ending.search(name):
+                    yield f"names = [{', '.join(map(quoted, names))}]"
 
 
 def _number_of_part(name: str) -> int:
