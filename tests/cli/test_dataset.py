@@ -103,6 +103,7 @@ def test_a_dry_run_refuses_what_the_run_would(cups: Path, capsys: pytest.Capture
         (("split",), "--shares train=0.8 val=0.2."),
         (("split", "--shares", "a=0.8", "b=0.3"), "whose sum is 1, not 1.1"),
         (("rename", "actoin=act"), "Did you mean 'action'?"),
+        (("shuffle", "--seed=-1"), "--seed is -1, allowed are 0 to"),
         (("drop-features",), "Name the features to leave out"),
         (("set-task",), "--task 'pick up the cup'"),
         (("set-task", "--task", "pull it", "--where", "num_frames > 8"), "No episode is selected"),

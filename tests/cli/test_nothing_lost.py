@@ -124,6 +124,16 @@ def test_append_keeps_existing_files_or_refuses(place: Path, target: str) -> Non
     assert (place / "mixed/data/notes.txt").read_text() == "years of work"
 
 
+def test_a_third_party_workshop_is_left_alone(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    workshop = place / ".new.demorec-part"
+    (workshop / "new").mkdir(parents=True)
+    (workshop / "new" / "chapter_2.tex").write_text("years of work")
+    before = files_of(place)
+    assert exit_code("export", "hdf5", place / "runs/run", "--out", place / "new") == 2
+    assert "not made by demorec" in capsys.readouterr().err
+    assert files_of(place) == before
+
+
 # A run: `generate --overwrite`.
 
 
@@ -237,6 +247,15 @@ def test_an_evaluation_with_foreign_files_is_not_overwritten(evaluation: Path, f
         opened(replace(SETTINGS, episode_length=7), evaluation, overwrite=False)
     assert "--overwrite" not in str(error.value)  # --overwrite would be refused
     assert files_of(evaluation) == before
+
+
+@pytest.mark.parametrize("name", ["episodes/episode_000000.mcap", "thesis.txt"])
+def test_a_folder_without_an_evaluation_is_not_overwritten(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(ConfigError, match="not part of an evaluation"):
+        opened(SETTINGS, tmp_path, overwrite=True)
+    assert files_of(tmp_path) == {name: b"mine"}
 
 
 def test_overwriting_an_evaluation_keeps_other_files(evaluation: Path) -> None:

@@ -141,6 +141,22 @@ def test_only_the_source_without_headers_uses_recording_times(imports: Imports, 
         assert values.tolist() == [*state.body["position"].tolist(), *gripper.body["data"].tolist()]
 
 
+def test_an_action_of_the_next_state_and_a_gripper_command(imports: Imports, tmp_path: Path) -> None:
+    """Joint actions are the next state; gripper actions are the latest command of a separate topic, row by row."""
+    notes = real(3.0)
+    mapping = MAPPING.replace('topic = "/joint_command"\nfield = "position"\n', 'next = "observation.state"\n')
+    mapping += f'[[features.action]]\ntopic = "{GRIPPER}"\nfield = "data"\nprefix = "g"\n'
+    code, told, error = imports(notes, mapping)
+    assert code == 0, told + error
+    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+        table = recording.table()
+    state, grippers = table.features["observation.state"], [note for note in notes if note.topic == GRIPPER]
+    for row, values in enumerate(table.features["action"][:-1]):
+        time_ns = int(table.time_ns[row])
+        gripper = max((note for note in grippers if note.log_ns <= time_ns), key=lambda note: note.log_ns)
+        assert values.tolist() == [*state[row + 1].tolist(), *gripper.body["data"].tolist()]
+
+
 def test_headers_far_from_times_of_recording_are_found_where_both_are_used(imports: Imports) -> None:
     _, told, _ = imports(real(skew_s=0.3), _with_gripper(stamp="log"))
     lines = [line for line in told.splitlines() if line.startswith("  clock_offset: ") and GRIPPER in line]

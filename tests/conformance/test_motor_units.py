@@ -102,6 +102,17 @@ def test_features_are_those_that_lerobot_records(dataset: Path, driver: Callable
     assert others == {"observation.state", "action", "observation.images.front"}
 
 
+def test_actions_are_the_radians_of_the_recording(run: Path, dataset: Path) -> None:
+    """A count is 0.088 degrees."""
+    with Recording(next((run / "episodes").iterdir())) as recording:
+        trajectory = recording.trajectory()
+        jaw = recording.info.simulated.robot.gripper.joint_position(trajectory.action_gripper)
+    _, action = columns(dataset)
+    assert np.abs(action[:, :5] - np.degrees(trajectory.action_joint_target)).max() < 0.1
+    assert np.abs(action[:, 5] - 100 * (jaw - JAW[0]) / (JAW[1] - JAW[0])).max() < 0.1
+    assert np.ptp(action[:, 5]) > 5
+
+
 def radians(run: Path) -> np.ndarray[Any, Any]:
     """(T, 6) of the recording, the jaw last."""
     with Recording(next((run / "episodes").iterdir())) as recording:

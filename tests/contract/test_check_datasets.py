@@ -116,6 +116,7 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "another rate": (of_info(lambda data: data.update(fps=20)), "video_format"),
     "rows in another order": (of_table("data", rows_exchanged), "unreadable_episodes"),
     "a wrong index": (of_rows("index"), "contradicting_counts"),
+    "the largest index": (value_of("index", 20, 2**63 - 1), "contradicting_counts"),
     "a wrong frame_index": (of_rows("frame_index"), "unreadable_episodes"),
     "a wrong timestamp": (of_rows("timestamp"), "time_grid"),
     "an unknown task": (value_of("task_index", 20, 7), "contradicting_counts"),

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support.check import checked, edit_column, edit_json, edit_parquet, simulate_run, verdict_of
+from support.commands import exit_code
 
 from demorec.check.report import CheckOptions, check_subjects, find_subjects
 from demorec.datasets.lerobot.export import export_lerobot
@@ -69,6 +71,14 @@ def test_the_good_one_passes(good: Path) -> None:
 def test_a_wrong_line_in_run_json(name: str, run: Path) -> None:
     edit_json(run / "run.json", LINES[name])
     assert verdict_of(run, "run_agrees", "run") == "broken"
+
+
+def test_info_and_check_agree_about_a_damaged_export(run: Path) -> None:
+    record = {"run_digest": "a", "repo_id": "local/a", "dataset_digest": "b", "seconds": 1.0}
+    for repo_id, code, verdict in (("local/a", 0, "good"), (None, 1, "broken")):
+        edit_json(run / "run.json", partial(dict.update, export={**record, "repo_id": repo_id}))
+        assert exit_code("info", run) == code
+        assert verdict_of(run, "run_files", "run") == verdict
 
 
 def recordings_exchanged(run: Path) -> None:

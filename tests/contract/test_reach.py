@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 from support.sim import episode, run
 
+from demorec.episode.variation import Ranges
+
 pytestmark = pytest.mark.slow
 
 
@@ -48,3 +50,13 @@ def farthest(index: int, **config: Any) -> float:
 def test_layouts_are_redrawn_until_the_arm_reaches_everything(robot: str) -> None:
     """The Panda reaches 0.855 m from a shoulder 0.33 m up, with a hand of 0.21 m; the iiwa reaches no further."""
     assert max(farthest(index, robot=robot) for index in range(20)) < 0.83
+
+
+def test_a_redrawn_layout_is_in_the_held_out_rectangle_too() -> None:
+    ranges = Ranges(held_out_x=(0.4, 1.1), held_out_y=(0.0, 0.1))
+    for index in range(10):
+        made = episode(index, task="support.odd_tasks:Wide", variation="none", split="eval", ranges=ranges)
+        (cube,) = made.info.simulated.scene.movable
+        x, y, _ = cube.world_from_body.position.tolist()
+        assert 0.4 <= x < 0.83
+        assert 0.0 <= y <= 0.1

@@ -51,6 +51,13 @@ def test_the_digest_depends_on_the_content_alone(run: Path, tmp_path: Path) -> N
     assert dataset_digest(tmp_path / "a") != whole
 
 
+def test_several_processes_write_the_same_files(run: Path, tmp_path: Path) -> None:
+    for workers in (1, 2):
+        export(run, tmp_path / f"d{workers}", workers=workers)
+    assert files_of(tmp_path / "d1") == files_of(tmp_path / "d2")
+    assert {path.name for path in tmp_path.iterdir()} == {"d1", "d2"}
+
+
 def test_an_mp4_file_holds_one_set_of_parameters(tmp_path: Path) -> None:
     for n, crf in enumerate((23, 23, 35)):
         write_episode(

@@ -1,4 +1,4 @@
-"""Keyframes: the hand's poses at the next commands that close or open the gripper."""
+"""Keyframes: the next commands that close or open the gripper, and the hand's poses at them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from lerobot_policy_act_keypoints.keyframes import keyframe_targets
+from lerobot_policy_act_keypoints.keyframes import find_keyframes, keyframe_targets
+
+
+def test_the_next_changes_are_found_and_never_those_of_another_episode() -> None:
+    episode = np.repeat([4, 7, 9], [8, 5, 3])
+    opening = np.array([1, 1, 1, 0, 0, 0, 1, 1, 0, 0, 1, 1, 1, 1, 1, 1]) * 0.08
+    found = find_keyframes(opening, episode)
+    assert found[:8].tolist() == [[3, 6]] * 3 + [[-1, 6]] * 3 + [[-1, -1]] * 2
+    assert found[8:13].tolist() == [[-1, 10]] * 2 + [[-1, -1]] * 3  # an initially closed gripper is not a change
+    assert found[13:].tolist() == [[-1, -1]] * 3
 
 
 def about_z(angle: float) -> list[float]:
