@@ -44,8 +44,10 @@ def spoilt(kind: str, own: Columns, other: Columns, rng: np.random.Generator) ->
 
 def write_spoilt(source: Path, out: Path, ratio: float, seed: int) -> None:
     """Copy a dataset without images through LeRobot, with a ratio of its episodes spoilt, each kind equally often."""
+    import datasets
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    datasets.disable_progress_bars()
     dataset = LeRobotDataset("local/source", root=source)
     table = dataset.hf_dataset.with_format("numpy")
     names = (STATE, ENVIRONMENT, ACTION)
