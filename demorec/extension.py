@@ -56,8 +56,7 @@ EXTENSION = Extension(
     },
     exporters={"lerobot": ExporterRow(target="demorec.datasets.lerobot.options:LEROBOT")},
     file_checks={
-        **_checks("file", "opens", "checksums", "topics", "readable", "complete", "frame_times", "stamps"),
-        **_checks("file", "video_frames", "missing_images", "images_decode"),
+        **_checks("file", "opens", "checksums", "readable", "complete", "missing_images", "images_decode"),
         **_checks("run", "run_files", "run_complete", "run_agrees"),
         **_checks("dataset", "run_dataset", "dataset_sidecar"),
     },
