@@ -94,21 +94,11 @@ class CheckResult:
     not_measured: str = ""
 
     @property
-    def worst(self) -> Finding | None:
-        """The first finding of the worst severity; None without findings."""
-        return max(self.findings, key=lambda finding: RANK[finding.severity], default=None)
-
-    @property
     def verdict(self) -> Verdict | Literal["not measured"]:
         """Severity of the worst finding."""
-        if self.worst is not None:
-            return self.worst.severity
-        return "not measured" if self.not_measured else "good"
-
-    @property
-    def message(self) -> str:
-        """Message of the worst finding, or the reason why it could not judge."""
-        return self.not_measured if self.worst is None else self.worst.message
+        if not self.findings:
+            return "not measured" if self.not_measured else "good"
+        return max((finding.severity for finding in self.findings), key=RANK.__getitem__)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,19 +14,12 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Checkable, Fault, NotApplicableError, check, listed
 from demorec.check.run import CheckedRun
-from demorec.core.errors import (
-    ConfigError,
-    DemorecError,
-    ExportError,
-    RecordingError,
-    describe_error,
-    resource_error,
-)
+from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error
+from demorec.core.plain import from_plain
 from demorec.datasets.episode import SUCCESS, ExportEpisode
-from demorec.datasets.lerobot.episode_places import EpisodePlace
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import episode_digests, noted, recorded_info, video_digests
+from demorec.datasets.lerobot.inspect import episode_digests, noted, recorded_info, usable_numbers, video_digests
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import is_dataset
 from demorec.datasets.lerobot.prepare import reasons_to_transcode, recorded_videos
@@ -38,6 +31,8 @@ from demorec.runs.run_file import DATASET, EPISODES, FAILED
 Rows = Mapping[str, NDArray[Any]]
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 """Sidecar keys that do not come from the recording."""
+_DECIDING_OPTIONS = ("action", "state", "privileged", "features", "include_failures", "fps", "depth")
+"""Export options that decide the content of the episodes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,18 +66,10 @@ class CheckedDataset(LeRobotFolder):
         for number, place in enumerate(self.listed):
             problems: list[str] = []
             with noted(problems, self.root):
-                rows[number] = self._usable(place, reader.numbers(place))
+                rows[number] = usable_numbers(self, reader, place)
             if problems:
                 errors[number] = problems[0]
         return rows, errors
-
-    def _usable(self, place: EpisodePlace, rows: Rows) -> Rows:
-        if place.length == 0:
-            raise ExportError(f"Episode {place.episode_index} has no frames: {self.root}")
-        for name, values in rows.items():
-            if self.info.features[name].dtype in ("int64", "bool") and values.dtype.kind not in "iub":
-                raise ExportError(f"Episode {place.episode_index} lacks values of {name}: {self.root}")
-        return rows
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:
@@ -184,16 +171,7 @@ def export_options(dataset: Path) -> ExportOptions:
     """
     try:
         made = read_json(dataset / EXPORT_PATH)
-        options = ExportOptions(
-            action=made["action"],
-            state=made.get("state", "joint"),
-            privileged=made["privileged"],
-            features=tuple(made.get("features", ())),
-            include_failures=made["include_failures"],
-            fps=made["fps"],
-            depth=made["depth"],
-            verify=False,
-        )
+        options = from_plain({name: made[name] for name in _DECIDING_OPTIONS}, ExportOptions)
         options.validate()
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(

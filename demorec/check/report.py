@@ -5,6 +5,7 @@ from __future__ import annotations
 import pkgutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +14,7 @@ from demorec.check.file import CheckedEpisode
 from demorec.check.run import CheckedRun
 from demorec.core.errors import check_option
 from demorec.core.extension import rows_of
-from demorec.core.processes import process_pool
+from demorec.core.processes import in_turn
 from demorec.core.tables import FILE_CHECKS
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
@@ -107,16 +108,7 @@ def useful_workers(subjects: Sequence[Subject], *, images: bool, cores: int) -> 
 
 def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterator[SubjectReport]:
     """Yield one report per subject, in order."""
-    if options.workers == 1 or len(subjects) < 2:
-        for subject in subjects:
-            yield check_subject(subject, options)
-        return
-    with process_pool(min(options.workers, len(subjects))) as pool:
-        # Datasets take longest, so they start first.
-        order = sorted(subjects, key=lambda subject: subject.kind != "dataset")
-        begun = {subject: pool.submit(check_subject, subject, options) for subject in order}
-        for subject in subjects:
-            yield begun[subject].result()
+    return in_turn(partial(check_subject, options=options), subjects, options.workers)
 
 
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:

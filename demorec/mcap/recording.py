@@ -349,11 +349,6 @@ class Recording(Closing):
                 images[camera] = messages.coded_images(found[topic], self.video_settings(camera).codec)
         return images
 
-    def keyframes(self, camera: str) -> NDArray[np.int64]:
-        """Find the numbers of a camera's images that are decodable on their own; its images are in memory together."""
-        codec = self.video_settings(camera).codec
-        return np.flatnonzero([is_keyframe(codec, image) for image in self.coded_images([camera])[camera].messages()])
-
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Yield segmentation images, (H, W) int32 as in `CameraImages`, one per frame; see `segment_names`."""
         if not self.has_segmentation(camera):

@@ -130,7 +130,7 @@ def test_bad_bags_are_skipped_and_listed(
         assert left_out[number]["reason"] in shown
     judged = result_of(run, "import_dropped", "run")
     assert judged.findings[0].value == str(len(BAD))
-    assert "run_1.mcap: The bag is empty" in judged.message
+    assert "run_1.mcap: The bag is empty" in judged.findings[0].message
 
 
 def test_the_run_is_the_same_for_any_number_of_workers(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:

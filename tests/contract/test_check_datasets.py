@@ -251,7 +251,7 @@ def test_episodes_that_the_sidecar_does_not_know(run: Path, tmp_path: Path) -> N
     pq.write_table(pq.read_table(path).slice(1), path)
     assert [episode.number for episode in CheckedDataset(spoilt / "dataset").described()] == [1, 2]
     (result,) = checked(spoilt / "dataset", "dataset", only=["dataset_sidecar"]).results
-    assert (result.verdict, result.message) == (
+    assert (result.verdict, result.findings[0].message) == (
         "broken",
         "episode 0 is unknown, perhaps recorded with LeRobot's resume",
     )
@@ -261,7 +261,7 @@ def test_episodes_that_the_sidecar_does_not_know(run: Path, tmp_path: Path) -> N
 def test_a_sidecar_of_other_episodes(dataset: Path) -> None:
     edit_parquet(next((dataset / "demorec/episodes").glob("*/*.parquet")), "episode_index", lambda _: [0, 1, 7])
     (result,) = checked(dataset, "dataset", only=["dataset_sidecar"]).results
-    assert (result.verdict, result.message) == (
+    assert (result.verdict, result.findings[0].message) == (
         "broken",
         "its rows have the episodes [0, 1, 7], the dataset has 3",
     )

@@ -164,6 +164,6 @@ def test_an_unexpected_error_hides_nothing(good: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr("demorec.extensions.doctor.checks.kinematics.arm_of", broken)
     results = {result.check: result for result in checked(good / "episodes" / "episode_000000.mcap").results}
     assert results["joint_limits"].verdict == "not measured"
-    assert "cannot be computed" in results["joint_limits"].message
-    assert "index" not in results["joint_limits"].message
+    assert "cannot be computed" in results["joint_limits"].not_measured
+    assert "index" not in results["joint_limits"].not_measured
     assert {results[name].verdict for name in ("opens", "checksums", "missing_numbers")} == {"good"}

@@ -230,7 +230,7 @@ def test_the_checks_judge_the_other_episodes(spoilt: tuple[Path, Path]) -> None:
     is_data = path.suffix == ".parquet"
     assert (found["unreadable_episodes"].verdict == "broken") == is_data
     assert (found["video_places"].verdict == "broken") != is_data
-    assert path.name in found["unreadable_episodes" if is_data else "video_places"].message
+    assert path.name in found["unreadable_episodes" if is_data else "video_places"].findings[0].message
     assert {found[name].verdict for name in ("missing_numbers", "contradicting_counts", "wrong_statistics")} <= {
         "good",
         "not measured",

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
 from demorec.datasets.lerobot.episode_places import EpisodePlace, has_episode_table
@@ -24,6 +25,7 @@ from demorec.datasets.lerobot.layout import (
     combined_digest,
     episode_digest,
 )
+from demorec.datasets.lerobot.rows import DataRows
 from demorec.datasets.lerobot.stats import NAMES
 from demorec.episode.features import ACTION, STATE
 from demorec.episode.info import EpisodeInfo
@@ -119,6 +121,17 @@ def noted(problems: list[str], root: Path) -> Iterator[None]:
         if (lack := resource_error(error)) is not None:
             raise lack from error
         problems.append(without_path(error, root).replace(f"{root}/", ""))
+
+
+def usable_numbers(folder: LeRobotFolder, rows: DataRows, place: EpisodePlace) -> dict[str, NDArray[Any]]:
+    """Read feature -> (T, D) of an episode. Raises ExportError if it has no frames, or lacks integers."""
+    if place.length == 0:
+        raise ExportError(f"Episode {place.episode_index} has no frames: {folder.root}")
+    columns = rows.numbers(place)
+    for name, values in columns.items():
+        if folder.info.features[name].dtype in ("int64", "bool") and values.dtype.kind not in "iub":
+            raise ExportError(f"Episode {place.episode_index} lacks values of {name}: {folder.root}")
+    return columns
 
 
 def without_digest(info: DatasetInfo) -> list[str]:

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import ConfigError, ExportError
-from demorec.datasets.lerobot.episode_places import EpisodePlace
+from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import noted
+from demorec.datasets.lerobot.inspect import noted, usable_numbers
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.videos import opened_video
 from demorec.episode.features import STATE
@@ -92,8 +91,7 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
         problems: list[str] = []
         columns: Mapping[str, NDArray[Any]] = {}
         with noted(problems, root):
-            columns = reader.numbers(place)
-            _refuse_empty(place, columns, folder)
+            columns = usable_numbers(folder, reader, place)
         if problems:
             unreadable[place.episode_index] = problems[0]
             continue
@@ -122,15 +120,6 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
         arm_joints=joints,
         opens_lerobot=options.lerobot,
     )
-
-
-def _refuse_empty(place: EpisodePlace, columns: Mapping[str, NDArray[Any]], folder: LeRobotFolder) -> None:
-    """Raise ExportError for an episode without frames, or without integers where info.json has them."""
-    if place.length == 0:
-        raise ExportError(f"Episode {place.episode_index} has no frames: {folder.root}")
-    for name, values in columns.items():
-        if folder.info.features[name].dtype in ("int64", "bool") and values.dtype.kind not in "iub":
-            raise ExportError(f"Episode {place.episode_index} lacks values of {name}: {folder.root}")
 
 
 def _robot(folder: LeRobotFolder, options: ReadOptions, elements: tuple[str, ...]) -> DatasetRobot | None:
