@@ -6,7 +6,6 @@ One generic implementation (`demorec.robots.kinematics_kernels`) instead of a ha
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from demorec.core.geometry import Array, Pose, quat_from_rotation, wrap_angle
 from demorec.robots.kinematics_kernels import forward, inverse, straight_path, tilt_and_roll
+from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf
 
 POSITION_TOLERANCE = 1e-5
@@ -42,34 +42,30 @@ FIVE_JOINTS = Freedom(cone=math.radians(15.0), roll=math.radians(2.0))
 class ArmKinematics:
     """A serial chain of n revolute joints from the base of a URDF to the tool centre point.
 
-    Fixed joints are merged; every other joint in the chain must be one of `arm_joints`.
+    Fixed joints are merged; every other joint in the chain must be one of the spec.
 
     Args:
-        urdf: URDF of the arm.
-        arm_joints: Names of the arm's joints, base to flange.
-        tcp_link: Link with its frame at the tool centre point.
-        lower, upper: (n,) position limits of the inverse kinematics, rad.
+        urdf: URDF of the arm, at any scale.
+        spec: Its joints, base to flange, their limits, and the link with its frame at the tool centre point.
 
     Attributes:
         num_joints: n.
         origins: (n, 3) position of each joint in the frame of its predecessor, metres.
-        lower, upper: The arguments.
+        lower, upper: (n,) position limits of the inverse kinematics, rad.
         freedom: Default freedom of poses.
         tables: Arm data for the compiled loops: `origins`, (n, 3, 3) the joints' rotations there, (n, 3) their unit
             axes, (3,) the TCP in the last joint's frame, metres, (3, 3) its rotation there, and the limits.
     Raises:
-        ValueError: The joints between base and `tcp_link` are not `arm_joints`, or one is not revolute.
+        ValueError: The joints between base and TCP are not the spec's, or one is not revolute.
     """
 
-    def __init__(
-        self, urdf: Urdf, *, arm_joints: Sequence[str], tcp_link: str, lower: Sequence[float], upper: Sequence[float]
-    ) -> None:
-        joints = urdf.path_to(tcp_link)
+    def __init__(self, urdf: Urdf, spec: RobotSpec) -> None:
+        joints = urdf.path_to(spec.tcp_link)
         moving = [joint for joint in joints if joint.kind != "fixed"]
         names = [joint.name for joint in moving]
-        if not names or names != list(arm_joints) or any(j.kind == "prismatic" for j in moving):
+        if not names or names != list(spec.arm_joints) or any(j.kind == "prismatic" for j in moving):
             found = [f"{joint.name} ({joint.kind})" for joint in moving]
-            raise ValueError(f"the joints to {tcp_link} are {found}, expected the revolute {list(arm_joints)}")
+            raise ValueError(f"the joints to {spec.tcp_link} are {found}, expected the revolute {spec.arm_joints}")
         origins, tool = [], Pose()
         for joint in joints:
             tool = tool @ joint.parent_from_joint
@@ -77,7 +73,8 @@ class ArmKinematics:
                 origins.append(tool)
                 tool = Pose()
         self.num_joints = len(origins)
-        self.lower, self.upper = (np.array(limit, dtype=np.float64) for limit in (lower, upper))
+        self.lower = np.array(spec.position_lower, dtype=np.float64)
+        self.upper = np.array(spec.position_upper, dtype=np.float64)
         self.freedom = WHOLE_POSE if len(origins) >= 6 else FIVE_JOINTS
         self.origins = np.array([pose.position for pose in origins])
         rotations = np.array([pose.rotation for pose in origins])

@@ -185,10 +185,4 @@ class Arm:
 
 def arm_kinematics(spec: RobotSpec, *, scale: float = 1.0) -> ArmKinematics:
     """Build a robot's kinematics from its URDF; raises as `demorec.robots.model_check.checked_urdf`."""
-    return ArmKinematics(
-        checked_urdf(spec, scale=scale),
-        arm_joints=spec.arm_joints,
-        tcp_link=spec.tcp_link,
-        lower=spec.position_lower,
-        upper=spec.position_upper,
-    )
+    return ArmKinematics(checked_urdf(spec, scale=scale), spec)

@@ -168,13 +168,7 @@ class _SimulatedEpisode(DatasetRecording):
             urdf = Urdf.load(asset_path(spec.urdf), scale=self.info.simulated.scene.robot.scale)
         else:
             urdf = self.robot.model
-        arm = ArmKinematics(
-            urdf,
-            arm_joints=spec.arm_joints,
-            tcp_link=spec.tcp_link,
-            lower=spec.position_lower,
-            upper=spec.position_upper,
-        )
+        arm = ArmKinematics(urdf, spec)
         return np.array([arm.forward(row).vector() for row in state[:, : arm.num_joints]])
 
     def _object_poses(self, values: Array) -> dict[str, Array]:
