@@ -25,30 +25,6 @@ from demorec.episode.info import Camera, EpisodeInfo, Feature, Simulation
 from demorec.episode.scene import Scene
 
 
-def simulated_info(
-    simulation: Simulation,
-    *,
-    sensors: Sequence[Feature] = (),
-    episode_index: int,
-    instruction: str,
-    fps: int,
-    attempt: int = 0,
-    versions: Mapping[str, str] | None = None,
-) -> EpisodeInfo:
-    """Describe an episode that demorec simulates, with the features of some sensors."""
-    return EpisodeInfo(
-        episode_index=episode_index,
-        attempt=attempt,
-        instruction=instruction,
-        robot_name=simulation.robot.name,
-        fps=fps,
-        features=simulated_features(simulation, sensors),
-        cameras=simulated_cameras(simulation.scene),
-        versions=versions or {},
-        simulation=simulation,
-    )
-
-
 def with_simulation(info: EpisodeInfo, **changes: Any) -> EpisodeInfo:
     """Change fields of an episode's `Simulation`, and with it cameras and names of elements; raises as `simulated`."""
     simulation = replace(info.simulated, **changes)

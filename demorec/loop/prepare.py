@@ -17,7 +17,7 @@ from demorec.core.seeding import Purpose, generator
 from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import Scene, SceneCamera
-from demorec.episode.simulated import simulated_info
+from demorec.episode.simulated import simulated_cameras, simulated_features
 from demorec.episode.variation import Ranges, error_values, resolve, true_cameras
 from demorec.objects.folder import load_shelf
 from demorec.render import Renderer
@@ -125,14 +125,16 @@ def prepare(plan: EpisodePlan) -> PreparedEpisode:
         config=to_plain(config),
         config_digest=digest(config),
     )
-    info = simulated_info(
-        simulation,
-        sensors=[sensor.feature(robot) for sensor in SENSORS],
+    info = EpisodeInfo(
         episode_index=plan.episode_index,
         attempt=plan.attempt,
         instruction=task.instruction(scene, _rng(plan, "expert")),
+        robot_name=robot.name,
         fps=config.fps,
+        features=simulated_features(simulation, [sensor.feature(robot) for sensor in SENSORS]),
+        cameras=simulated_cameras(scene),
         versions=deciding_versions(config),
+        simulation=simulation,
     )
     return PreparedEpisode(
         plan=plan,

@@ -28,7 +28,7 @@ from demorec.episode.episode import (
 )
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import Body, Goal, Physics, RobotPlacement, Scene, SceneCamera, Shape
-from demorec.episode.simulated import simulated_info
+from demorec.episode.simulated import simulated_cameras, simulated_features
 from demorec.mcap import EpisodeWriter
 from demorec.robots.panda import PANDA
 from demorec.sim.sensors import SENSORS
@@ -69,13 +69,15 @@ def make_episode(
         config={"task": "pick_place", "seed": seed, "video": {"codec": "h264"}},
         config_digest="0123456789abcdef",
     )
-    info = simulated_info(
-        simulation,
-        sensors=[sensor.feature(PANDA) for sensor in SENSORS],
+    info = EpisodeInfo(
         episode_index=episode_index,
         instruction="pick up the red cube and place it on the green target",
+        robot_name=PANDA.name,
         fps=fps,
+        features=simulated_features(simulation, [sensor.feature(PANDA) for sensor in SENSORS]),
+        cameras=simulated_cameras(simulation.scene),
         versions={"demorec": "0.1.0", "pybullet": "3.2.7", "numpy": "2.2.6"},
+        simulation=simulation,
     )
     substeps = physics_hz // fps
     frames = []
