@@ -120,7 +120,7 @@ def resource_error(error: BaseException, path: Path | None = None) -> ResourceEr
 
 
 _UNUSABLE = {errno.EACCES, errno.EEXIST, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOENT, errno.ENOTDIR}
-_UNUSABLE |= {errno.EPERM, errno.EROFS}
+_UNUSABLE |= {errno.EINVAL, errno.EPERM, errno.EROFS}
 """Errors that another target fixes; others concern the machine, such as a full disk."""
 
 

@@ -11,12 +11,11 @@ import fcntl
 import hashlib
 import json
 import os
-import platform
 import stat
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, Self
@@ -175,26 +174,18 @@ def run_lock(folder: Path) -> Iterator[None]:
     not inherit the lock (the descriptor is closed on exec).
 
     Raises:
-        ConfigError: Another process holds it (the error names that process), or the folder cannot be written to.
+        ConfigError: Another process holds it, the lock is not a file, or the folder cannot be written to.
     """
     path = folder / LOCK_NAME
     try:
         descriptor = open_locked(path)
     except BlockingIOError as error:
-        owner = read_text_limited(path, 200).strip() or "another process"
         raise ConfigError(
-            f"Another run is writing here ({owner}): wait until it ends, or choose another --out: {folder}"
+            f"Another run is writing here: wait until it ends, or choose another --out: {folder}"
         ) from error
     except OSError as error:
-        if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):
-            raise ConfigError(
-                f"The lock of the output folder is not a file: remove it, or choose another --out: {path}"
-            ) from error
-        raise resource_error(error) or write_error("The output folder", error, folder, DemorecError) from error
+        raise resource_error(error) or write_error("The lock of the run", error, path, DemorecError) from error
     try:
-        with suppress(OSError):  # on a full disk the owner cannot be recorded
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"process {os.getpid()} on {platform.node()}\n".encode(), 0)
         yield
     finally:
         os.close(descriptor)

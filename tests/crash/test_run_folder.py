@@ -137,7 +137,9 @@ def test_a_lock_that_is_not_a_file_is_reported(
     (out / ".lock").unlink()
     make(out / ".lock")
     before = (out / "run.json").read_bytes()
-    with pytest.raises(ConfigError, match=r"The lock of the output folder is not a file: remove it.*\.lock"):
+    with pytest.raises(
+        ConfigError, match=r"The lock of the run cannot be written \(it is .*, not a regular file\): .*\.lock"
+    ):
         run_fake(out)
     assert (out / "run.json").read_bytes() == before
 
