@@ -32,12 +32,6 @@ class CheckedEpisode(ExitStack):
         self.path = path
         self.colours = colours
 
-    def __exit__(self, *error: Any) -> bool | None:
-        """Free everything: parts that refer to the whole would keep its images until the next garbage collection."""
-        result = super().__exit__(*error)
-        vars(self).clear()
-        return result
-
     @cached_property
     def recording(self) -> Recording:
         """The open recording."""

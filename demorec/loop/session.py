@@ -202,11 +202,11 @@ class ActionNoise:
     Every command stays within the joint limits in position and velocity.
     """
 
-    def __init__(self, world: World, *, sigma: float, rng: np.random.Generator, fps: int) -> None:
+    def __init__(self, world: World, *, sigma: float, rng: np.random.Generator) -> None:
         self._arm = world.arm
         self._sigma, self._rng = sigma, rng
-        self._decay = (1.0 - NOISE_DECAY) ** (30 / fps)
-        self._max_step = np.array(world.robot.velocity_limit) / fps
+        self._decay = (1.0 - NOISE_DECAY) ** (30 / world.fps)
+        self._max_step = np.array(world.robot.velocity_limit) / world.fps
         self._noise: Array = np.zeros(len(self._max_step))
         self._last: Array = world.arm.target.copy()
 
@@ -242,7 +242,7 @@ class ScriptAgent:
         """See `Agent`."""
         behaviour = self._episode.behaviour
         self._expert, self._gave_up = Expert(world, behaviour), None
-        noise = ActionNoise(world, sigma=behaviour.action_noise, rng=self._episode.rng("noise"), fps=world.fps)
+        noise = ActionNoise(world, sigma=behaviour.action_noise, rng=self._episode.rng("noise"))
         for step in self._steps(self._expert):
             yield replace(step, command=noise.command(step))
 

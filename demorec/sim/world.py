@@ -249,18 +249,11 @@ class World(Closing):
         linear, angular = self.client.getBaseVelocity(self._bodies[name])
         return np.array(linear), np.array(angular)
 
-    def finger_forces(self, name: str) -> tuple[float, ...]:
-        """Read the normal force (N) of each finger on a body of the scene."""
-        return tuple(
-            float(
-                sum(contact[9] for contact in self.client.getContactPoints(self.arm.body, self._bodies[name], link, -1))
-            )
-            for link in self.arm.finger_links
-        )
-
     def grip_force(self, name: str) -> float:
         """Compute the force (N) with which the hand grips a body of the scene; 0 unless every finger touches it."""
-        return min(self.finger_forces(name))
+        read, body = self.client.getContactPoints, self._bodies[name]
+        touching = [read(self.arm.body, body, link, -1) for link in self.arm.finger_links]
+        return min(float(sum(contact[9] for contact in contacts)) for contacts in touching)
 
     def pressed_from_above(self, name: str, *, force: float = 3.0) -> bool:
         """Check whether the hand pushes down on a body with more than `force` N (contacts steeper than 45 degrees)."""

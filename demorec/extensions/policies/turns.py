@@ -120,7 +120,7 @@ class Turns:
         world, rng = self._env.world, self._env.episode.rng("noise")
         expert = Expert(world, self._behaviour)
         expert.note(TAKE_OVER_EVENT, f"{_MESSAGE}{reason}")
-        noise = ActionNoise(world, sigma=self._behaviour.action_noise, rng=rng, fps=world.fps)
+        noise = ActionNoise(world, sigma=self._behaviour.action_noise, rng=rng)
         for step in self._steps(expert):
             yield self._step(replace(step, command=noise.command(step), is_deliberate_miss=False))
             self.num_retries = expert.num_retries
