@@ -6,8 +6,7 @@ names.
 
 Memory means pages that the child has filled (resident and private), which the parent checks 20 to 100 times a second.
 RLIMIT_DATA also counts memory that is only reserved: 1 GB each by PyArrow and Rerun, and thread stacks. It is therefore
-set higher, as a limit that holds even when the parent is not scheduled in time. Only Linux reports all of this;
-elsewhere commands run without limits.
+set higher, as a limit that holds even when the parent is not scheduled in time.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from __future__ import annotations
 import os
 import resource
 import signal
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -87,7 +85,7 @@ def continue_in_child(words: Sequence[str]) -> None:
     Signals sent to the parent alone are forwarded, and the child dies with the parent. Does not fork if there are no
     limits for these words, the command line without the program's name.
     """
-    if sys.platform != "linux" or os.environ.get(VARIABLE) == "off":
+    if os.environ.get(VARIABLE) == "off":
         return
     limits = Limits.of(words)
     if limits is None:
@@ -116,13 +114,12 @@ def remove_limits() -> None:
 
 
 def end_with_parent(parent: int) -> None:
-    """Let the kernel kill this process (Linux) when the parent's thread that started it ends."""
-    if sys.platform == "linux":
-        import ctypes
+    """Let the kernel kill this process when the parent's thread that started it ends."""
+    import ctypes
 
-        ctypes.CDLL(None).prctl(_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # the parent was killed before this call
-            os._exit(1)
+    ctypes.CDLL(None).prctl(_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # the parent was killed before this call
+        os._exit(1)
 
 
 def _limit_this_process(parent: int, limits: Limits) -> None:
