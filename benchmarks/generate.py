@@ -177,7 +177,7 @@ def be_today(args: argparse.Namespace) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from demorec.core.config import GenerateConfig
-    from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
+    from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 
     config = GenerateConfig(
         renderer="tiny", width=args.size, height=args.size, seed=args.seed, cameras=tuple(args.cameras)
@@ -196,7 +196,8 @@ def be_today(args: argparse.Namespace) -> None:
         "local/today", config.fps, features, root=args.be_today, streaming_encoding=args.streaming
     )
     first = prepare(EpisodePlan(config=config, episode_index=args.first))
-    with make_world(first.info) as world, make_renderer(first.info) as renderer:
+    with SimulatorCache() as simulators:
+        world, renderer = simulators.acquire(first.info)
         made = []
         for index in range(args.first, args.first + args.episodes):
             before, num_frames = os.times(), 0

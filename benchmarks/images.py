@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.tables import TASKS
-from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
+from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 
 Pixels = NDArray[np.uint8]
 WIDTH, HEIGHT = 320, 240
@@ -30,7 +30,8 @@ EPISODES = {"line_up": 2}
 def grasp_and_end(config: GenerateConfig, index: int) -> tuple[Pixels, Pixels, str]:
     """The front camera's images at the first grasp and at the end of an episode, and its instruction."""
     episode = prepare(EpisodePlan(config=config, episode_index=index))
-    with make_world(episode.info) as world, make_renderer(episode.info) as renderer:
+    with SimulatorCache() as simulators:
+        world, renderer = simulators.acquire(episode.info)
         frames = list(Session.of_episode(world, episode, renderer).run(ScriptAgent(episode)))
     held = min(frames, key=lambda f: (f.phase not in CARRYING, not f.observation.contact_force, f.frame_index))
     return held.images["front"].color, frames[-1].images["front"].color, episode.info.instruction

@@ -17,7 +17,7 @@ import numpy as np
 from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig
 from demorec.episode.episode import Frame, Outcome
 from demorec.episode.info import EpisodeInfo
-from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
+from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.video import make_encoder
 
@@ -27,7 +27,8 @@ WAYS = [*STREAMS, VideoConfig(codec="jpeg")]
 
 def simulate(config: GenerateConfig) -> tuple[EpisodeInfo, list[Frame], Outcome]:
     episode = prepare(EpisodePlan(config=config, episode_index=0))
-    with make_world(episode.info) as world, make_renderer(episode.info) as renderer:
+    with SimulatorCache() as simulators:
+        world, renderer = simulators.acquire(episode.info)
         session = Session.of_episode(world, episode, renderer)
         return episode.info, list(session.run(ScriptAgent(episode))), session.outcome
 

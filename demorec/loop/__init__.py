@@ -1,8 +1,9 @@
 """The closed loop, the only place that steps a world: an agent decides, a session executes and yields frames.
 
     episode = prepare(EpisodePlan(config=GenerateConfig(), episode_index=0))  # info, task, behaviour; no simulator
-    with make_world(episode.info) as world, make_renderer(episode.info) as renderer:  # both reusable
-        session = Session.of_episode(world, episode, renderer)  # renderer=None for no images
+    with SimulatorCache() as simulators:
+        world, renderer = simulators.acquire(episode.info)  # both are reused; no renderer without cameras
+        session = Session.of_episode(world, episode, renderer)
         for frame in session.run(ScriptAgent(episode)):  # the world is reset here, then one control step a frame
             print(frame.frame_index, frame.phase, frame.observation.gripper_width)
         print(session.outcome)
@@ -11,7 +12,7 @@ Its callers are generation, replay and the gymnasium environment that evaluates 
 of its plan: its bits depend neither on the worker nor on earlier runs in the same world.
 """
 
-from demorec.loop.prepare import PreparedEpisode, SimulatorCache, load_task, make_renderer, make_world, prepare
+from demorec.loop.prepare import PreparedEpisode, SimulatorCache, load_task, make_world, prepare
 from demorec.loop.session import Agent, ScriptAgent, Session
 from demorec.tasks.script import Step
 
@@ -23,7 +24,6 @@ __all__ = [
     "SimulatorCache",
     "Step",
     "load_task",
-    "make_renderer",
     "make_world",
     "prepare",
 ]

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from demorec.core.config import EpisodePlan, GenerateConfig, cpu_type, deciding_versions
 from demorec.core.errors import ConfigError
+from demorec.core.files import Closing
 from demorec.core.geometry import Pose
 from demorec.core.plain import digest, to_plain
 from demorec.core.registry import is_foreign, modules_of
 from demorec.core.seeding import Purpose, generator
-from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
+from demorec.core.tables import CAMERAS, TASKS, camera_name, load_robot
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.simulated import simulated_cameras, simulated_features
@@ -204,20 +204,8 @@ def make_world(info: EpisodeInfo) -> World:
     return World(info.simulated.robot, fps=info.fps, sample_joints=info.simulated.config.get("joint_rate") == "physics")
 
 
-def make_renderer(info: EpisodeInfo) -> AbstractContextManager[Renderer | None]:
-    """Create the renderer that an episode's config names, or None without cameras; a context manager in both cases.
-
-    Raises:
-        ConfigError: Unknown renderer.
-        MissingDependencyError, RenderError: It does not work on this machine.
-    """
-    if not info.simulated.scene.cameras:
-        return nullcontext(None)
-    return RENDERERS.load(str(info.simulated.config.get("renderer", "raster")))()
-
-
-class SimulatorCache:
-    """World and renderer reused across episodes, remade only for one that needs different ones; `close` frees both."""
+class SimulatorCache(Closing):
+    """World and renderer reused across episodes, remade only for one that needs different ones; a context manager."""
 
     def __init__(self) -> None:
         self._world: World | None = None

@@ -23,7 +23,7 @@ from demorec.episode.episode import Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import on_request
 from demorec.extensions.policies.gym_env import DemorecEnv, env_id
-from demorec.loop import ScriptAgent, Session, make_renderer, make_world
+from demorec.loop import ScriptAgent, Session, SimulatorCache
 from demorec.loop.actions import ACTION_KINDS
 from demorec.mcap import Recording
 
@@ -128,7 +128,8 @@ def test_images_are_those_of_the_rollout() -> None:
     env = make(split="all", **options)
     assert "environment_state" not in env.observation_space.spaces
     observation, _ = env.reset(seed=5)
-    with make_world(prepared.info) as world, make_renderer(prepared.info) as renderer:
+    with SimulatorCache() as simulators:
+        world, renderer = simulators.acquire(prepared.info)
         for frame in Session.of_episode(world, prepared, renderer).run(ScriptAgent(prepared)):
             for camera, images in frame.images.items():
                 assert np.array_equal(observation["pixels"][camera], images.color)

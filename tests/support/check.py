@@ -25,7 +25,7 @@ from demorec.episode.info import EpisodeInfo
 from demorec.extensions.doctor.check_command import split_checks
 from demorec.extensions.doctor.examine import examine
 from demorec.extensions.doctor.from_dataset import ReadOptions
-from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
+from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.container import Container
 from demorec.mcap.frames import frames_of
@@ -45,10 +45,10 @@ def simulate(path: Path, *, episode_index: int = 0, **config: Any) -> Path:
     episode = prepare(plan)
     path.parent.mkdir(parents=True, exist_ok=True)
     with (
-        make_world(episode.info) as world,
-        make_renderer(episode.info) as renderer,
+        SimulatorCache() as simulators,
         EpisodeWriter(path, episode.info, video=plan.config.video) as writer,
     ):
+        world, renderer = simulators.acquire(episode.info)
         session = Session.of_episode(world, episode, renderer)
         for frame in session.run(ScriptAgent(episode)):
             writer.write(frame)

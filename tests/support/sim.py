@@ -6,7 +6,7 @@ from typing import Any
 
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.episode.episode import Frame, Outcome
-from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_renderer, make_world, prepare
+from demorec.loop import PreparedEpisode, ScriptAgent, Session, SimulatorCache, prepare
 from demorec.sim.world import World
 
 
@@ -18,16 +18,15 @@ def episode(index: int = 0, *, attempt: int = 0, **config: Any) -> PreparedEpiso
 
 def first_frame(prepared: PreparedEpisode) -> Frame:
     """Observation before any motion; its images need no episode around them."""
-    with make_world(prepared.info) as world, make_renderer(prepared.info) as renderer:
+    with SimulatorCache() as simulators:
+        world, renderer = simulators.acquire(prepared.info)
         return next(Session.of_episode(world, prepared, renderer).run(ScriptAgent(prepared)))
 
 
 def run(prepared: PreparedEpisode, world: World | None = None) -> tuple[list[Frame], Outcome]:
-    if world is None:
-        with make_world(prepared.info) as fresh:
-            return run(prepared, fresh)
-    with make_renderer(prepared.info) as renderer:
-        session = Session.of_episode(world, prepared, renderer)
+    with SimulatorCache() as simulators:
+        fresh, renderer = simulators.acquire(prepared.info)
+        session = Session.of_episode(fresh if world is None else world, prepared, renderer)
         frames = list(session.run(ScriptAgent(prepared)))
     return frames, session.outcome
 
