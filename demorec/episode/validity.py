@@ -19,7 +19,6 @@ from demorec.episode.info import Camera, EpisodeInfo, Feature, Simulation
 from demorec.episode.mesh import decode_mesh
 from demorec.episode.scene import Body, Scene, SceneCamera
 from demorec.episode.simulated import simulated_cameras, simulated_features
-from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf
 
 _MAX_BODIES = 255
@@ -71,7 +70,9 @@ def find_problems(info: EpisodeInfo) -> list[str]:
 def _simulation(simulation: Simulation) -> Iterator[str]:
     robot, scene = simulation.robot, simulation.scene
     yield from _in_range("", simulation, "root_seed", "physics_hz")
-    yield from _robot(robot)
+    if not robot.arm_joints:
+        yield "the robot has no arm joints"
+    yield from _names("joints of the robot", robot.joint_names)
     yield from _scene(scene)
     placed = len(scene.robot.joint_position)
     if placed != len(robot.arm_joints):
@@ -91,18 +92,6 @@ def _contradictions(info: EpisodeInfo, simulation: Simulation) -> Iterator[str]:
     yield from _names("features", [feature.name for feature in info.features])
     if info.cameras != simulated_cameras(simulation.scene):
         yield "the cameras are not those of the scene"
-
-
-def _robot(robot: RobotSpec) -> Iterator[str]:
-    if not robot.arm_joints:
-        yield "the robot has no arm joints"
-    yield from _names("joints of the robot", robot.joint_names)
-    for name in ("home_q", "position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit"):
-        values: tuple[float, ...] = getattr(robot, name)
-        if len(values) != len(robot.arm_joints):
-            yield f"{name} of the robot has {len(values)} numbers for {len(robot.arm_joints)} arm joints"
-        if name.endswith("_limit") and not all(value > 0 for value in values):
-            yield f"{name} of the robot is not positive"
 
 
 def _scene(scene: Scene) -> Iterator[str]:

@@ -20,7 +20,6 @@ from demorec.robots.urdf import JointDynamics, Urdf, UrdfJoint, parse_xml, read_
 
 LIMIT_TOLERANCE = 1e-4
 """Maximum excess of a spec's position limit over the URDF's, rad or m: both are rounded."""
-_PER_ARM_JOINT = ("home_q", "position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit")
 _MAX_NAMES = 30
 _LINKAGES = 'docs/robots.md, "Grippers with linkages", describes the remedy'
 
@@ -78,10 +77,6 @@ def _choices(what: str, name: str, names: Iterable[str]) -> str:
 
 
 def _wrong_counts(spec: RobotSpec) -> Iterator[str]:
-    for field in _PER_ARM_JOINT:
-        count = len(getattr(spec, field))
-        if count != len(spec.arm_joints):
-            yield f"{field} has {count} numbers for {len(spec.arm_joints)} arm joints; give one for each joint"
     gripper, wanted = spec.gripper, 1 + len(spec.gripper.gear_ratios)
     if len(gripper.joints) != wanted:
         kind = type(gripper).__name__

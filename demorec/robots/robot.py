@@ -187,6 +187,9 @@ Gripper = ParallelGripper | JawGripper
 """A gripper of any kind; all have the same methods."""
 
 
+_PER_ARM_JOINT = ("home_q", "position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit")
+
+
 @dataclass(frozen=True, kw_only=True)
 class RobotSpec:
     """An arm with a gripper, as data.
@@ -226,6 +229,14 @@ class RobotSpec:
     gripper: Gripper
     task_scale: float = 1.0
     wrist_camera: tuple[tuple[float, float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in _PER_ARM_JOINT:
+            values = getattr(self, name)
+            if len(values) != len(self.arm_joints):
+                raise ValueError(f"{name} has {len(values)} numbers for {len(self.arm_joints)} arm joints")
+            if name.endswith("_limit") and min(values, default=1.0) <= 0:
+                raise ValueError(f"{name} has numbers that are not above 0")
 
     @property
     def joint_names(self) -> tuple[str, ...]:

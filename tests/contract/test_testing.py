@@ -69,7 +69,6 @@ HOME = RobotContract.test_home_points_the_hand_down_with_the_fingers_across
 @pytest.mark.parametrize(
     ("change", "test", "words"),
     [
-        ({"velocity_limit": (1.0, 2.0)}, SPEC, "velocity_limit has 2 numbers for 7 arm joints"),
         ({"position_upper": (9.0,) * 7}, SPEC, "the limits of panda_joint1 are -2.8973 to 9 rad"),
         ({"home_q": (0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0)}, HOME, "at home_q is turned"),
         ({"home_q": (0.5, -0.785, 0.0, -2.356, 0.0, 1.571, 1.285)}, HOME, "to the side"),
@@ -85,3 +84,11 @@ def test_each_fault_of_a_robot_is_found(
 
     with pytest.raises(AssertionError, match=words):
         test(Contract())
+
+
+def test_a_robot_has_as_many_numbers_as_joints_and_limits_above_zero() -> None:
+    panda: RobotSpec = ROBOTS.load("panda")
+    with pytest.raises(ValueError, match="velocity_limit has 2 numbers for 7 arm joints"):
+        replace(panda, velocity_limit=(1.0, 2.0))
+    with pytest.raises(ValueError, match="torque_limit has numbers that are not above 0"):
+        replace(panda, torque_limit=(0.0,) * 7)
