@@ -172,22 +172,16 @@ def _pass_on(number: int, child: int, heard: int) -> None:
 
 def _private_bytes(pid: int) -> int:
     """Memory that a process has filled; 0 if it has ended."""
-    _, resident, shared, *_ = _words_of(f"/proc/{pid}/statm") or (b"0", b"0", b"0")
+    _, resident, shared, *_ = _words_of(f"/proc/{pid}/statm") or ("0", "0", "0")
     return (int(resident) - int(shared)) * resource.getpagesize()
 
 
-def _words_of(path: str) -> list[bytes]:
-    """Read the words of a file in /proc; empty if the process has ended (five times faster than Path.read_text)."""
+def _words_of(path: str) -> list[str]:
+    """Read the words of a file in /proc; empty if the process has ended."""
     try:
-        descriptor = os.open(path, os.O_RDONLY)
+        return Path(path).read_text().split()
     except OSError:
         return []
-    try:
-        return os.read(descriptor, 65536).split()
-    except OSError:
-        return []
-    finally:
-        os.close(descriptor)
 
 
 def _tell_death(command: str, limits: Limits, number: signal.Signals, is_too_large: bool) -> NoReturn:
