@@ -10,6 +10,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import SceneError
@@ -18,7 +19,7 @@ from demorec.core.plain import from_json
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Simulation
 from demorec.episode.mesh import decode_mesh
 from demorec.episode.scene import Body, Scene, SceneCamera
-from demorec.episode.simulated import simulated_cameras, simulated_features
+from demorec.episode.simulated import with_simulation
 from demorec.robots.urdf import Urdf
 
 _MAX_BODIES = 255
@@ -81,17 +82,12 @@ def _simulation(simulation: Simulation) -> Iterator[str]:
 
 def _contradictions(info: EpisodeInfo, simulation: Simulation) -> Iterator[str]:
     """Yield contradictions within the description of a valid simulation."""
-    if info.robot_name != simulation.robot.name:
-        yield f"the robot is {info.robot_name!r} and {simulation.robot.name!r}"
-    known = simulated_features(simulation, list(info.sensors.values()))
     for feature in info.sensors.values():
         yield from _feature(feature, frozenset())
         yield from _sensor_stream(feature)
-    if unknown := [feature.name for feature in info.features if feature not in known]:
-        yield f"the features {', '.join(unknown)} are not those of its robot"
     yield from _names("features", [feature.name for feature in info.features])
-    if info.cameras != simulated_cameras(simulation.scene):
-        yield "the cameras are not those of the scene"
+    if replace(with_simulation(info), robot_name=simulation.robot.name) != info:
+        yield "the robot, the features or the cameras are not those of its scene"
 
 
 def _scene(scene: Scene) -> Iterator[str]:
