@@ -153,88 +153,68 @@ def read_collada(path: Path) -> ColladaTriangles:
         OSError: The file cannot be read.
         ValueError, LookupError, ElementTree.ParseError: It is not COLLADA, or contains no triangles.
     """
-    scene = _ColladaScene(ElementTree.parse(path).getroot())
-    if not scene.points:
+    root = ElementTree.parse(path).getroot()
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]  # without the namespace
+    by_id = {f"#{element.attrib['id']}": element for element in root.iter() if "id" in element.attrib}
+    unit = root.find("asset/unit")
+    scale = 1.0 if unit is None else float(unit.attrib.get("meter", 1.0))
+    # PyBullet applies the unit but not up_axis; shapes must match its physics.
+    axes = np.diag([scale, scale, scale, 1.0])
+    points: list[Array] = []
+    normals: list[Array] = []
+    for name, matrix in [found for scene in root.iter("visual_scene") for found in _geometries(scene, axes)]:
+        for part in [part for kind in _PARTS for part in by_id[name].iter(kind)]:
+            inputs = {each.attrib["semantic"]: each for each in part.findall("input")}
+            index = _fans(part, stride=1 + max(int(each.attrib.get("offset", 0)) for each in part.findall("input")))
+            if not len(index):
+                continue
+            points.append(_values(inputs["VERTEX"], index, by_id) @ matrix[:3, :3].T + matrix[:3, 3])
+            if "NORMAL" in inputs:
+                normals.append(_values(inputs["NORMAL"], index, by_id) @ np.linalg.inv(matrix[:3, :3]))
+    if not points:
         raise ValueError("no visual scene with triangles")
-    points = np.concatenate(scene.points)
-    normals = np.concatenate(scene.normals)
-    return ColladaTriangles(points, normals if len(normals) == len(points) else None)
+    has_normals = sum(map(len, normals)) == sum(map(len, points))
+    return ColladaTriangles(np.concatenate(points), np.concatenate(normals) if has_normals else None)
 
 
-class _ColladaScene:
-    """`points` and `normals` (3 n, 3) at the corners of each part's triangles; no normals if the part has none."""
-
-    def __init__(self, root: ElementTree.Element) -> None:
-        self.points: list[Array] = []
-        self.normals: list[Array] = []
-        self._tag = root.tag.removesuffix("COLLADA")
-        self._by_id = {"#" + node.attrib["id"]: node for node in root.iter() if "id" in node.attrib}
-        asset = root.find(f"{self._tag}asset")
-        unit = None if asset is None else asset.find(f"{self._tag}unit")
-        scale = 1.0 if unit is None else float(unit.attrib.get("meter", 1.0))
-        # PyBullet applies the unit but not up_axis; shapes must match its physics.
-        axes = np.diag([scale, scale, scale, 1.0])
-        for scene in self._all_of(root, "visual_scene"):
-            for node in scene.findall(f"{self._tag}node"):
-                self._visit(node, axes)
-
-    def _all_of(self, node: ElementTree.Element, name: str) -> list[ElementTree.Element]:
-        return node.findall(f".//{self._tag}{name}")
-
-    def _visit(self, node: ElementTree.Element, matrix: Array) -> None:
-        """Collect a node and its descendants; (4, 4) is the transform of its parent."""
-        for child in node:
-            name = child.tag.removeprefix(self._tag)
-            if name in _TRANSFORMS:
-                matrix = matrix @ _transform(name, np.array((child.text or "").split(), dtype=np.float64))
-        for instance in node.findall(f"{self._tag}instance_geometry"):
-            for kind in ("triangles", "polylist", "polygons"):
-                for part in self._all_of(self._by_id[instance.attrib["url"]], kind):
-                    self._add(part, kind, matrix)
-        for child in node.findall(f"{self._tag}node"):
-            self._visit(child, matrix)
-
-    def _add(self, part: ElementTree.Element, kind: str, matrix: Array) -> None:
-        inputs = {i.attrib["semantic"]: i for i in part.findall(f"{self._tag}input")}
-        stride = 1 + max(int(i.attrib.get("offset", 0)) for i in part.findall(f"{self._tag}input"))
-        index = self._fans(part, kind, stride)
-        if not len(index):
-            return
-        linear = matrix[:3, :3]
-        self.points.append(self._values(inputs["VERTEX"], index) @ linear.T + matrix[:3, 3])
-        if "NORMAL" in inputs:
-            self.normals.append(self._values(inputs["NORMAL"], index) @ np.linalg.inv(linear))
-        else:
-            self.normals.append(np.zeros((0, 3)))
-
-    def _fans(self, part: ElementTree.Element, kind: str, stride: int) -> NDArray[np.int64]:
-        """Compute (3 n, stride) input indices at the corners of a part's triangles; polygons are split into fans."""
-        rows: list[NDArray[np.int64]] = [
-            np.array((p.text or "").split(), dtype=np.int64).reshape(-1, stride) for p in part.findall(f"{self._tag}p")
-        ]
-        if kind == "polylist":
-            counts = [int(v) for v in (part.findtext(f"{self._tag}vcount") or "").split()]
-            rows = np.split(rows[0], np.cumsum(counts)[:-1]) if rows and counts else []
-        elif kind == "triangles":
-            rows = list(rows[0].reshape(-1, 3, stride)) if rows else []
-        fans = [row[[0, i, i + 1]] for row in rows for i in range(1, len(row) - 1)]
-        return np.concatenate(fans) if fans else np.zeros((0, stride), dtype=np.int64)
-
-    def _values(self, source: ElementTree.Element, index: NDArray[np.int64]) -> Array:
-        return self._resolve(source.attrib["source"])[index[:, int(source.attrib.get("offset", 0))]]
-
-    def _resolve(self, reference: str) -> Array:
-        node = self._by_id[reference]
-        if node.tag == f"{self._tag}vertices":
-            position = next(i for i in node.findall(f"{self._tag}input") if i.attrib["semantic"] == "POSITION")
-            return self._resolve(position.attrib["source"])
-        array = node.find(f"{self._tag}float_array")
-        accessor = node.find(f".//{self._tag}accessor")
-        width = 3 if accessor is None else int(accessor.attrib.get("stride", 3))
-        values = [] if array is None or array.text is None else array.text.split()
-        return np.array(values, dtype=np.float64).reshape(-1, width)[:, :3]
+def _geometries(node: ElementTree.Element, matrix: Array) -> Iterator[tuple[str, Array]]:
+    """Yield the reference of each geometry of a node and its descendants, and its (4, 4) place in metres."""
+    for child in node:
+        if child.tag in _TRANSFORMS:
+            matrix = matrix @ _transform(child.tag, np.array((child.text or "").split(), dtype=np.float64))
+    for instance in node.findall("instance_geometry"):
+        yield instance.attrib["url"], matrix
+    for child in node.findall("node"):
+        yield from _geometries(child, matrix)
 
 
+def _fans(part: ElementTree.Element, *, stride: int) -> NDArray[np.int64]:
+    """Compute (3 n, stride) input indices at the corners of a part's triangles; polygons are split into fans."""
+    rows: list[NDArray[np.int64]] = [
+        np.array((p.text or "").split(), dtype=np.int64).reshape(-1, stride) for p in part.findall("p")
+    ]
+    if part.tag == "polylist":
+        counts = [int(v) for v in (part.findtext("vcount") or "").split()]
+        rows = np.split(rows[0], np.cumsum(counts)[:-1]) if rows and counts else []
+    elif part.tag == "triangles":
+        rows = list(rows[0].reshape(-1, 3, stride)) if rows else []
+    fans = [row[[0, i, i + 1]] for row in rows for i in range(1, len(row) - 1)]
+    return np.concatenate(fans) if fans else np.zeros((0, stride), dtype=np.int64)
+
+
+def _values(source: ElementTree.Element, index: NDArray[np.int64], by_id: Mapping[str, ElementTree.Element]) -> Array:
+    """Read the (3 n, 3) vectors of an input at the corners of triangles."""
+    node = by_id[source.attrib["source"]]
+    if node.tag == "vertices":
+        node = by_id[next(i for i in node.findall("input") if i.attrib["semantic"] == "POSITION").attrib["source"]]
+    accessor = node.find(".//accessor")
+    width = 3 if accessor is None else int(accessor.attrib.get("stride", 3))
+    values = np.array((node.findtext("float_array") or "").split(), dtype=np.float64)
+    return values.reshape(-1, width)[:, :3][index[:, int(source.attrib.get("offset", 0))]]
+
+
+_PARTS = ("triangles", "polylist", "polygons")
 _TRANSFORMS = ("matrix", "translate", "scale", "rotate")
 
 
