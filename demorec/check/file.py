@@ -14,9 +14,21 @@ import numpy as np
 from demorec.check.base import Fault, Form, NotApplicableError, check, listed
 from demorec.core.errors import RecordingError
 from demorec.episode.episode import NO_IMAGE
-from demorec.mcap import Recording
+from demorec.mcap import Recording, messages
 from demorec.mcap.container import Container
+from demorec.mcap.scan import Block
 
+_STAMPED = (
+    messages.JOINT_STATE,
+    messages.POSE,
+    messages.WRENCH,
+    messages.COMPRESSED_IMAGE,
+    messages.COMPRESSED_VIDEO,
+    messages.LOG,
+)
+"""Types whose first field is a timestamp, alone or in a header."""
+_CDR_BYTES = 4
+"""Size of the CDR header before the first field."""
 MAX_MISSING_RATIO = 0.5
 """Maximum ratio of frames without an image: a camera that is missing more often shows nothing."""
 
@@ -62,17 +74,33 @@ def opens(episode: CheckedEpisode) -> Iterator[Fault]:
     return iter(())
 
 
-@file_check(measures="damaged chunks, and messages that differ from the index")
+@file_check(measures="damaged chunks, and messages that differ from index or header")
 def checksums(episode: CheckedEpisode) -> Iterator[Fault]:
-    """Verify the checksum of every chunk, and the counts of the index."""
-    found = Counter[str]()
+    """Verify the checksum of every chunk, the counts of the index and, in a simulation, the timestamps in headers."""
+    recording = episode.recording
+    stamped = {topic for topic, (schema, _) in recording.topics.items() if schema in _STAMPED}
+    found, shifted = Counter[str](), Counter[str]()
     with closing(Container(episode.path)) as container:
         for blocks in container.blocks_by_chunk(container.channels):
-            found.update({topic: len(block.time_ns) for topic, block in blocks.items()})
-    counts = container.counts.items()
-    return listed(
-        [f"{topic}: {found[topic]}, the index has {count}" for topic, count in counts if found[topic] != count]
-    )
+            for topic, block in blocks.items():
+                found[topic] += len(block)
+                if topic in stamped and recording.info.simulation is not None:
+                    shifted[topic] += _count_other_stamps(block)
+    wrong = [
+        f"{topic}: {found[topic]}, the index has {count}"
+        for topic, (_, count) in recording.topics.items()
+        if found[topic] != count
+    ]
+    wrong += [
+        f"{topic}: {count} headers with another time than the message" for topic, count in shifted.items() if count
+    ]
+    return listed(wrong)
+
+
+def _count_other_stamps(block: Block) -> int:
+    """Count the messages with another time in their first field, seconds and nanoseconds, than in the file."""
+    stamps = block.heads(_CDR_BYTES + 8)[:, _CDR_BYTES:].copy().view("<i4").astype(np.int64)
+    return int(np.count_nonzero(stamps[:, 0] * 1_000_000_000 + stamps[:, 1] != block.time_ns))
 
 
 @file_check(measures="streams that lack messages or do not decode")
