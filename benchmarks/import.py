@@ -49,7 +49,6 @@ name = "benchmark"
 text = "measure"
 [clock]
 fps = 30
-rows = "/front/image"
 [[features."observation.state"]]
 topic = "/follower/joint_states"
 field = "position"

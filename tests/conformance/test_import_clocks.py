@@ -122,14 +122,12 @@ def test_simulated_time(mapping: str, imports: Imports, tmp_path: Path) -> None:
         assert times == [note.header_ns for note in bags.of_topic(notes, FRONT)]
 
 
-def _with_gripper(**keys: str) -> str:
-    lines = "".join(f'{key} = "{value}"\n' for key, value in keys.items())
-    return MAPPING + f'[[features."observation.state"]]\ntopic = "{GRIPPER}"\nfield = "data"\nprefix = "g"\n{lines}'
+WITH_GRIPPER = f'{MAPPING}[[features."observation.state"]]\ntopic = "{GRIPPER}"\nfield = "data"\nprefix = "g"\n'
 
 
 def test_only_the_source_without_headers_uses_recording_times(imports: Imports, tmp_path: Path) -> None:
     notes = real()
-    code, told, _ = imports(notes, _with_gripper(stamp="log"))
+    code, told, _ = imports(notes, WITH_GRIPPER)
     assert code == 0
     assert "No findings." in told
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
@@ -158,7 +156,7 @@ def test_an_action_of_the_next_state_and_a_gripper_command(imports: Imports, tmp
 
 
 def test_headers_far_from_times_of_recording_are_found_where_both_are_used(imports: Imports) -> None:
-    _, told, _ = imports(real(skew_s=0.3), _with_gripper(stamp="log"))
+    _, told, _ = imports(real(skew_s=0.3), WITH_GRIPPER)
     lines = [line for line in told.splitlines() if line.startswith("  clock_offset: ") and GRIPPER in line]
     assert len(lines) == 1
     assert "+0.31" in lines[0] or "+0.30" in lines[0]
@@ -170,7 +168,7 @@ def test_simulated_headers_next_to_missing_ones_are_refused(imports: Imports) ->
     gripper = [
         replace(note, log_ns=note.log_ns - bags.EPOCH_NS + WALL_NS) for note in real(3.0) if note.topic == GRIPPER
     ]
-    code, told, error = imports(bags.in_order(isaac() + gripper), _with_gripper())
+    code, told, error = imports(bags.in_order(isaac() + gripper), WITH_GRIPPER)
     assert (code, told) == (1, "")
     assert "clock_offset" in error
     assert 'clock.stamp = "log"' in error

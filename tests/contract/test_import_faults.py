@@ -71,15 +71,13 @@ def test_images_that_come_unevenly_are_not_lost(notes: bags.Notes, tmp_path: Pat
     assert {"drops", "gap"}.isdisjoint(_findings(bags.write_mcap(uneven, tmp_path / "bag.mcap"), tmp_path))
 
 
-def test_headers_without_time_are_accepted_if_the_mapping_expects_them(notes: bags.Notes, tmp_path: Path) -> None:
+def test_a_topic_without_times_in_its_headers_is_only_noted(notes: bags.Notes, tmp_path: Path) -> None:
     """As with JointTrajectory, where time 0 means "at once"."""
     unstamped = bags.changed(notes, ACTION, lambda k, note: replace(note, header_ns=0))
     bag = bags.write_mcap(unstamped, tmp_path / "bag.mcap")
-    place = f'topic = "{ACTION}"'
-    text = MAPPING.replace(place, f'{place}\nstamp = "log"')
-    assert set(_findings(bag, tmp_path, MAPPING)) == {"unstamped"}
+    assert set(_findings(bag, tmp_path)) == {"note"}
     shutil.rmtree(tmp_path / "run")
-    assert _findings(bag, tmp_path, text) == {}
+    assert _findings(bag, tmp_path, MAPPING.replace("fps = 30", 'fps = 30\nstamp = "log"')) == {}
 
 
 @pytest.mark.parametrize("kind", ["drops", "nothing"])
@@ -97,8 +95,9 @@ def test_check_reads_the_report(kind: str, notes: bags.Notes, tmp_path: Path) ->
 
 
 def test_dropped_episodes_are_reported(notes: bags.Notes, tmp_path: Path) -> None:
-    bag = bags.write_mcap(hurt(notes, "a long pause"), tmp_path / "bag.mcap")
-    cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.6], [0.6, 1.3]]\n'
+    marks = bags.texts("/episode", [(0.1, "start"), (0.6, "stop"), (0.61, "start"), (1.3, "stop")])
+    bag = bags.write_mcap(bags.in_order([*hurt(notes, "a long pause"), *marks]), tmp_path / "bag.mcap")
+    cut = '[episodes]\ncut = "marker"\ntopic = "/episode"\n'
     text = MAPPING.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
     text = text.replace("[cameras.front]", cut + "[cameras.front]")
     import_bags([bag], bag_mappings.write_mapping(text, tmp_path / "robot.toml"), tmp_path / "run")

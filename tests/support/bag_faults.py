@@ -85,7 +85,9 @@ FAULTS: dict[str, Fault] = {
         kind="clock_offset", hurt=_each(SIDE, lambda k, n: _later(n, 0.08))
     ),
     "a clock that drifts": Fault(kind="clock_drift", hurt=_each(STATE, lambda k, n: _later(n, 0.0008 * k))),
-    "headers without time": Fault(kind="unstamped", hurt=_each(STATE, lambda k, n: replace(n, header_ns=0))),
+    "headers without time": Fault(
+        kind="unstamped", hurt=_each(STATE, lambda k, n: replace(n, header_ns=0) if k % 3 == 0 else n)
+    ),
     "images lost": Fault(kind="drops", hurt=_each(FRONT, lambda k, n: None if k in (20, 21, 40) else n)),
     "a pause within the allowed age": Fault(kind="gap", hurt=_each(ACTION, lambda k, n: None if 40 <= k < 47 else n)),
     "a long pause": Fault(kind="gap", hurt=_each(FRONT, lambda k, n: None if 20 <= k < 35 else n), is_refused=True),

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.extensions.imports.bag import NS
-from demorec.extensions.imports.mapping import Clock, Sampling
+from demorec.extensions.imports.mapping import Clock
 from demorec.extensions.imports.streams import Stream
 
 MISSING = 2**62
@@ -39,10 +39,10 @@ class Timeline:
         times_ns: (M,) int64, strictly increasing.
         order: (M,) indices of the stream's messages. Excludes all but the first of equal times, messages without a
         time if others have one, and video before its first keyframe.
-        is_header, is_log_asked: Whether times are header times; whether the mapping requests log times.
+        is_header: Whether times are header times.
         period_ns: Usual interval, 0 for fewer than two messages.
         is_regular: Whether intervals are similar; false for a stream that publishes only changes.
-        sample, max_age_ns: Sampling rule of the rows, and maximum age of the messages that they take.
+        max_age_ns: Maximum age of the messages that rows take.
     """
 
     stream: Stream
@@ -51,8 +51,6 @@ class Timeline:
     is_header: bool
     period_ns: int
     is_regular: bool
-    is_log_asked: bool
-    sample: Sampling
     max_age_ns: int
 
     @property
@@ -63,7 +61,7 @@ class Timeline:
     @property
     def rule(self) -> str:
         """Sampling rule in words."""
-        return f"{self.sample} by {'header' if self.is_header else 'log'} time"
+        return f"latest by {'header' if self.is_header else 'log'} time"
 
     @property
     def skews_ns(self) -> Int:
@@ -72,7 +70,9 @@ class Timeline:
 
     def chosen(self, rows_ns: Int) -> ChosenSamples:
         """Messages that rows at these times (R,) take."""
-        return choose(self.times_ns, rows_ns, self.sample)
+        index = np.searchsorted(self.times_ns, rows_ns, side="right") - 1
+        age = np.where(index >= 0, rows_ns - self.times_ns[np.maximum(index, 0)], MISSING)
+        return ChosenSamples(index=index, age_ns=age)
 
     def within(self, begin_ns: int, end_ns: int) -> Int:
         """Times between two moments."""
@@ -81,10 +81,9 @@ class Timeline:
 
 def timeline(stream: Stream, clock: Clock) -> Timeline:
     """Build the timeline of a stream, by header times if requested and if most messages have one."""
-    by_header = (stream.part.stamp or clock.stamp) == "header"
     age_s = clock.max_age_s if stream.part.max_age_s is None else stream.part.max_age_s
     stamped = stream.header_ns > 0
-    is_header = by_header and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
+    is_header = clock.stamp == "header" and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
     times = stream.header_ns if is_header else stream.log_ns
     usable = np.flatnonzero(stamped) if is_header else np.arange(len(times))
     order: Int = usable[np.argsort(times[usable], kind="stable")]
@@ -106,8 +105,6 @@ def timeline(stream: Stream, clock: Clock) -> Timeline:
         is_header=is_header,
         period_ns=period,
         is_regular=is_regular,
-        is_log_asked=not by_header,
-        sample=stream.part.sample or clock.sample,
         max_age_ns=MISSING - 1 if age_s >= 1e9 else round(age_s * NS),
     )
 
@@ -118,30 +115,11 @@ class ChosenSamples:
 
     Attributes:
         index: (R,) index of the message in its timeline; -1 for none.
-        age_ns: (R,) row time minus message time, negative if the message is later; MISSING without a message.
+        age_ns: (R,) row time minus message time; MISSING without a message.
     """
 
     index: Int
     age_ns: Int
-
-
-def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> ChosenSamples:
-    """Choose the messages for some rows.
-
-    Args:
-        times_ns: (M,) strictly increasing, M > 0.
-        rows_ns: (R,) increasing.
-        sample: latest: the last message at or before the row; nearest: the closest one, the earlier of two equally
-        close.
-    """
-    before = np.searchsorted(times_ns, rows_ns, side="right") - 1
-    since = np.where(before >= 0, rows_ns - times_ns[np.maximum(before, 0)], MISSING)
-    if sample == "latest":
-        return ChosenSamples(index=before, age_ns=since)
-    after = np.minimum(before + 1, len(times_ns) - 1)
-    until = np.where(before + 1 < len(times_ns), times_ns[after] - rows_ns, MISSING)
-    is_later = until < since
-    return ChosenSamples(index=np.where(is_later, after, before), age_ns=np.where(is_later, -until, since))
 
 
 def grid(begin_ns: int, end_ns: int, fps: int, streams: Sequence[Int] = ()) -> Int:

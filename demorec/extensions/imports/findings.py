@@ -47,7 +47,8 @@ class ImportFinding:
 def bag_findings(bag: Timelines) -> tuple[ImportFinding, ...]:
     """Findings about a bag's messages, each once."""
     lines = list(bag.lines.values())
-    found = [finding for line in lines for finding in _stream_findings(line)]
+    is_log_asked = bag.mapping.clock.stamp == "log"
+    found = [finding for line in lines for finding in _stream_findings(line, is_log_asked=is_log_asked)]
     if not _have_another_epoch(lines):
         found += [finding for line in lines for finding in _skew_findings(line)]
     found += [ImportFinding(kind="cut_off", stream="", text=problem) for problem in bag.streams.problems]
@@ -62,15 +63,16 @@ def _of(line: Timeline, kind: str, text: str) -> ImportFinding:
     return ImportFinding(kind=kind, stream=line.stream.label, text=f"{line.stream.topic}: {text}")
 
 
-def _stream_findings(line: Timeline) -> Iterator[ImportFinding]:
+def _stream_findings(line: Timeline, *, is_log_asked: bool) -> Iterator[ImportFinding]:
     """Findings about a stream alone."""
     stream = line.stream
     if stream.num_malformed:
         text = f"{stream.num_malformed} messages cannot be used, the first since {stream.first_problem}"
         yield _of(line, "malformed", text)
     unstamped = int(np.sum((stream.header_ns <= 0) & (stream.header_ns != NO_STAMP)))
-    if unstamped and not line.is_log_asked:
-        yield _of(line, "unstamped", f"{unstamped} of {len(stream)} headers have no time")
+    if unstamped and not is_log_asked:
+        kind = NOTE if unstamped == len(stream) else "unstamped"
+        yield _of(line, kind, f"{unstamped} of {len(stream)} headers have no time")
     stamps = stream.header_ns if line.is_header else stream.log_ns
     known = stamps[stamps > 0]
     if late := max(int(np.sum(np.diff(stream.log_ns) < 0)), int(np.sum(np.diff(known) < 0))):

@@ -111,7 +111,7 @@ def stream_figures(line: Timeline, episodes: Sequence[EpisodeRows]) -> dict[str,
     steps = np.diff(line.times_ns)
     usual = steps[(steps > 0.4 * line.period_ns) & (steps < 1.6 * line.period_ns)]
     chosen = [line.chosen(rows.table.time_ns) for rows in episodes]
-    ages = [np.abs(choice.age_ns).max() for choice in chosen]
+    ages = [choice.age_ns.max() for choice in chosen]
     return {
         "stream": line.stream.label,
         "topic": line.stream.topic,

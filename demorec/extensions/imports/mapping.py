@@ -21,15 +21,11 @@ from demorec.core.plain import digest
 
 SourceKind = Literal["bag", "hdf5"]
 Unit = Literal["", "rad", "degree", "m", "mm"]
-Sampling = Literal["latest", "nearest"]
-Stamp = Literal["header", "log"]
 MAX_FPS = 1000
 MAX_ELEMENTS = 4096
 """Maximum elements of a source: larger ones are images or point clouds, not vectors."""
 MAX_SECONDS = 1e9
 """Maximum of any time in a mapping: larger ones exceed 64-bit nanoseconds."""
-ROWS = ("camera", "grid")
-"""Values of `Clock.rows` that are not topics."""
 KIND = "kind"
 """Key in a field's metadata: the only kind of source with this field."""
 
@@ -55,8 +51,6 @@ class Source:
         topic: Topic of the numbers, for bags.
         field: Path of the numbers in a message: "position", "pose.orientation", "transforms[child_frame_id=hand]".
         joints: Elements by name, in this order, if the message names them.
-        stamp: As `Clock.stamp`, for this source.
-        sample: As `Clock.sample`, for this source.
         max_age_s: As `Clock.max_age_s`, for this source.
         dataset: Dataset of the numbers below the episode's group, for HDF5 files: (T, D) or (T,).
         elements: Elements by number, in this order (auto: all).
@@ -76,8 +70,6 @@ class Source:
     topic: str = _bag("")
     field: str = _bag("")
     joints: tuple[str, ...] = _bag(())
-    stamp: Stamp | None = _bag(None)
-    sample: Sampling | None = _bag(None)
     max_age_s: float | None = _bag(None)
     dataset: str = _hdf5("")
 
@@ -95,8 +87,6 @@ class CameraSource:
         topic: Topic of a bag: sensor_msgs Image or CompressedImage, foxglove RawImage, CompressedImage or
         CompressedVideo.
         info_topic: Topic of its calibration (CameraInfo, CameraCalibration).
-        stamp: As `Clock.stamp`, for this camera.
-        sample: As `Clock.sample`, for this camera.
         max_age_s: As `Clock.max_age_s`, for this camera.
         dataset: Dataset of an HDF5 file below the episode's group: (T, H, W, 3) or (T, 3, H, W) uint8; or a JPEG file
         in each row, (T, N) uint8 padded with zeros or (T,) of variable length; for a depth camera (T, H, W) or
@@ -107,8 +97,6 @@ class CameraSource:
 
     topic: str = _bag("")
     info_topic: str = _bag("")
-    stamp: Stamp | None = _bag(None)
-    sample: Sampling | None = _bag(None)
     max_age_s: float | None = _bag(None)
     dataset: str = _hdf5("")
     colors: Literal["rgb", "bgr"] = _hdf5("rgb")
@@ -171,18 +159,16 @@ class Clock:
     Attributes:
         fps: Rows per second, also of the dataset. Required for bags; 0 uses the HDF5 file's own rate.
         rows: "camera": a row for each image of the slowest camera among those with `fps` images per second (without
-        any, a grid); "grid": evenly spaced; or a topic: a row for each of its messages.
+        any, a grid); "grid": evenly spaced.
         stamp: Whether a message's time is its header time or its log time.
-        sample: The last message before the row, or the nearest one.
-        max_age_s: Maximum distance of a message from the row.
-        when_old: Treatment of messages that are farther away or missing.
+        max_age_s: Maximum age of a message at its row, which takes the last one before it.
+        when_old: Treatment of messages that are older or missing.
         max_trim_s: Maximum time to leave out at the bag's beginning and end if a stream starts late or ends early.
     """
 
     fps: int = 0
-    rows: str = _bag("camera")
-    stamp: Stamp = _bag("header")
-    sample: Sampling = _bag("latest")
+    rows: Literal["camera", "grid"] = _bag("camera")
+    stamp: Literal["header", "log"] = _bag("header")
     max_age_s: float = _bag(0.2)
     when_old: Literal["error", "drop_episode"] = _bag("error")
     max_trim_s: float = _bag(1.0)
@@ -193,7 +179,7 @@ class Episodes:
     """Boundaries of episodes.
 
     Attributes:
-        cut: Whether a whole bag is one episode, or markers or a list of times split it.
+        cut: Whether a whole bag is one episode, or markers split it.
         topic: Topic of the markers.
         field: Field of the text, number or boolean in a marker.
         start, stop: Texts of markers that begin and end an episode (text only; a boolean does both).
@@ -203,10 +189,9 @@ class Episodes:
         ignore: Marker texts without a meaning; other unknown texts are errors.
         group: Group of an HDF5 file in which each group is an episode, "/" for the root; "" if the file itself is one.
         mask: Use only the episodes listed in this dataset of `mask`.
-        times_s: [begin, end] of each episode, seconds from the bag's first message.
     """
 
-    cut: Literal["file", "marker", "times"] = _bag("file")
+    cut: Literal["file", "marker"] = _bag("file")
     topic: str = _bag("")
     field: str = _bag("data")
     start: str = _bag("start")
@@ -215,7 +200,6 @@ class Episodes:
     failure: str = _bag("failure")
     discard: tuple[str, ...] = _bag(("discard",))
     ignore: tuple[str, ...] = _bag(())
-    times_s: tuple[tuple[float, float], ...] = _bag(())
     group: str = _hdf5("")
     mask: str = _hdf5("")
 

@@ -160,11 +160,8 @@ def _bag_problems(mapping: SourceMapping) -> Iterator[str]:
     fields = {task.topic: task.field, **({episodes.topic: episodes.field} if episodes.cut == "marker" else {})}
     if mapping.subtasks.topic and fields.get(mapping.subtasks.topic, mapping.subtasks.field) != mapping.subtasks.field:
         yield f"subtasks.field is {mapping.subtasks.field!r}, but another field of the same topic is taken for texts"
-    for cut, key in (("marker", "topic"), ("times", "times_s")):
-        if episodes.cut == cut and not getattr(episodes, key):
-            yield f'episodes.cut = "{cut}" needs episodes.{key}'
-    if any(not -MAX_SECONDS <= begin < end <= MAX_SECONDS for begin, end in episodes.times_s):
-        yield f"episodes.times_s has an episode that ends before it begins, or a time beyond {MAX_SECONDS:g} s"
+    if episodes.cut == "marker" and not episodes.topic:
+        yield 'episodes.cut = "marker" needs episodes.topic'
     if not 0 <= clock.max_trim_s <= MAX_SECONDS:
         yield f"clock.max_trim_s is {clock.max_trim_s:g}, it must be 0 to {MAX_SECONDS:g}"
 

@@ -163,17 +163,6 @@ def windows(lines: Timelines) -> list[Window]:
     episodes = lines.mapping.episodes
     if episodes.cut == "file":
         return [Window(begin_ns=begin, end_ns=end)]
-    if episodes.cut == "times":
-        found = [
-            Window(begin_ns=begin + round(first * NS), end_ns=begin + round(last * NS))
-            for first, last in episodes.times_s
-        ]
-        if outside := [window for window in found if window.begin_ns >= end]:
-            raise BagError(
-                f"An episode begins {(outside[0].begin_ns - begin) / NS:g} s after the first message, the bag has only "
-                f"{(end - begin) / NS:.1f} s"
-            )
-        return found
     markers = lines.streams.texts[episodes.topic]
     known = {True, False, "", *_words(episodes)}
     if episodes.topic == lines.mapping.subtasks.topic:

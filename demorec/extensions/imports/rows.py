@@ -25,7 +25,7 @@ from demorec.extensions.imports.clock import (
     timeline,
 )
 from demorec.extensions.imports.image_messages import KEPT_FORMATS, VIDEO_FORMATS, ImageHead
-from demorec.extensions.imports.mapping import ROWS, SourceMapping
+from demorec.extensions.imports.mapping import SourceMapping
 from demorec.extensions.imports.streams import BagStreams, Key
 
 RATE = 0.05
@@ -173,11 +173,6 @@ class Timelines:
     def _times(self, window: Window, begin: int, end: int) -> tuple[Int, str]:
         """(R,) row times, and the stream that they follow."""
         clock = self.mapping.clock
-        if clock.rows not in ROWS:
-            line = next((line for line in self.lines.values() if line.stream.topic == clock.rows), None)
-            if line is None:
-                raise BagError(f"clock.rows is {clock.rows!r}, from which the mapping takes no feature or camera")
-            return line.within(begin, end), line.stream.label
         if clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
             return self._followed(cameras, window, begin, end), f"camera {cameras[0]}"
         # A stream faster than the rows has skipped messages for any choice of rows. (The median period of a
@@ -208,8 +203,7 @@ class Timelines:
         # An image from shortly before another stream's start is used as soon as that stream has data.
         first = max(window.begin_ns, begin - line.period_ns // 2)
         lead = np.unique(np.maximum(line.within(first, end), begin))
-        are_latest = all(self.lines[name].sample == "latest" for name in cameras)
-        others = [self.lines[name].times_ns for name in cameras[1:]] if are_latest else []
+        others = [self.lines[name].times_ns for name in cameras[1:]]
         return followed(lead, others, period_ns=line.period_ns, end_ns=end)
 
 
@@ -224,20 +218,17 @@ def _first(line: Timeline, window: Window) -> int:
 def _last(line: Timeline, window: Window) -> int:
     """Time until which a stream has data: its last message is valid until the next would have arrived."""
     last = max(0, int(np.searchsorted(line.times_ns, window.end_ns, side="right")) - 1)
-    age = line.max_age_ns
-    if line.is_regular:
-        age = min(age, line.period_ns if line.sample == "latest" else line.period_ns // 2)
+    age = min(line.max_age_ns, line.period_ns) if line.is_regular else line.max_age_ns
     return int(line.times_ns[last]) + age
 
 
 def _too_old(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
     """Reason why the rows' data is missing or too old; "" if it is not."""
-    ages = np.abs(chosen.age_ns)
-    bad = np.flatnonzero((ages > line.max_age_ns) | (chosen.index < 0))
+    bad = np.flatnonzero(chosen.age_ns > line.max_age_ns)
     if not len(bad):
         return ""
-    worst = int(ages[bad].max())
-    what = "has nothing" if worst >= MISSING else f"is up to {worst / NS:.3f} s away"
+    worst = int(chosen.age_ns[bad].max())
+    what = "has nothing" if worst >= MISSING else f"is up to {worst / NS:.3f} s old"
     return (
         f"{line.label} {what} at {len(bad)} of {len(times)} rows, from {(times[bad[0]] - times[0]) / NS:.2f} s on, "
         f"allowed are {line.max_age_ns / NS:g} s"

@@ -32,7 +32,7 @@ from demorec.extensions.imports.fields import (
     stamp_of,
 )
 from demorec.extensions.imports.image_messages import ImageHead, image_head
-from demorec.extensions.imports.mapping import ROWS, CameraSource, Source, SourceMapping, Unit
+from demorec.extensions.imports.mapping import CameraSource, Source, SourceMapping, Unit
 from demorec.mcap.cdr import Values
 from demorec.mcap.scan import ScannedMessage
 
@@ -196,8 +196,7 @@ class BagStreams:
         self.texts: dict[str, list[Text]] = {topic: [] for topic in self._fields}
         self.infos: dict[str, Values] = {}
         self._info_topics = {camera.info_topic: name for name, camera in mapping.cameras.items() if camera.info_topic}
-        followed = {mapping.clock.rows}.difference(ROWS)
-        self._wanted = {*self._of_topic, *self._fields, *self._info_topics, *followed}
+        self._wanted = {*self._of_topic, *self._fields, *self._info_topics}
         self._counts: dict[str, int] = {}
         self._types: defaultdict[str, set[str]] = defaultdict(set)
         self._refused: dict[str, str] = {}
@@ -261,10 +260,6 @@ class BagStreams:
                 reason = stream.first_problem or stream.first_refusal
                 problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
         for stream in self.all.values():
-            if stream.part.stamp == "header" and len(stream) and max(stream.stamped) <= 0:
-                problems.append(
-                    f'{stream.label} has stamp = "header", but the headers of {stream.topic} have no time: write "log"'
-                )
             if stream.heads and not stream.are_keyframes.any():
                 reason = stream.first_problem or "it has no keyframe with its parameter sets"
                 problems.append(f"{stream.topic} cannot be decoded: {reason}")

@@ -46,7 +46,6 @@ _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
 _CAMERA_WORD = re.compile(r"[^a-z0-9]+")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
 _DEPTH_WORDS = {"depth", "aligned", "to", "compresseddepth", "registered"}
-_LOG = 'stamp = "log"  # its headers have no time'
 Kind = Literal["joints", "gripper", "pose"]
 
 
@@ -235,7 +234,6 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
         lines += ["", f"[cameras.{camera}]", f"topic = {quoted(name)}"]
         info = name.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[0] + "/camera_info"
         lines += [f"info_topic = {quoted(info)}"] if info in topics else []
-        lines += [] if topics[name].stamps_ns else [_LOG]
     return lines
 
 
@@ -299,7 +297,7 @@ def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequ
     rate = rates[slowest] if slowest else min(rates.values(), default=_USUAL_FPS)
     yield f"fps = {min(max(1, round(rate)), MAX_FPS)}"
     if slowest:
-        yield f'rows = "camera"  # a row for each image of the slowest, {quoted(slowest)}; or "grid", or a topic'
+        yield f'rows = "camera"  # a row for each image of the slowest, {quoted(slowest)}; or "grid"'
     yield 'when_old = "error"  # or "drop_episode"'
 
 
@@ -319,5 +317,3 @@ def _sources(feature: str, parts: Sequence[_Part], topics: Mapping[str, _Topic])
             yield f"prefix = {quoted('_'.join(own or [str(number)]) + '_')}"
         if topic.row_rate_hz and (age_s := 2 / topic.row_rate_hz) > Clock(fps=1).max_age_s:
             yield f"max_age_s = {math.ceil(age_s * 10) / 10:.1f}  # its messages are that far apart"
-        if not topic.stamps_ns:
-            yield _LOG
