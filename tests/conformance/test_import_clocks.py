@@ -205,7 +205,7 @@ def test_the_suggested_task_is_that_of_each_bag(
     code = exit_code("import", *paths, "--mapping", mapping, "--out", tmp_path / "run")
     if task is None:
         assert code == 2
-        assert "[task] needs one of text, topic and file_name" in capsys.readouterr().err
+        assert "[task] needs one of text and file_name" in capsys.readouterr().err
         return
     for index, instruction in enumerate((task, "push the block")):
         with Recording(tmp_path / f"run/episodes/episode_{index:06d}.mcap") as recording:

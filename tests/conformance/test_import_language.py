@@ -1,7 +1,8 @@
-"""Subtasks recorded in a bag become the language columns of a dataset, row by row, with nothing added."""
+"""Subtasks of external recordings become the language columns of a dataset, row by row, with nothing added."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,32 +11,27 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
-from support import bag_mappings, bags
 from support.commands import exit_code
 from support.export import export, recordings
+from support.external import make_external, write_external
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.errors import ConfigError
 from demorec.mcap import Recording, SampledWriter, recover
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
-ARM = [note for note in bags.so101(3.0) if "joint_states" in note.topic]
-MAPPING = bag_mappings.SO101.split("[cameras.front]")[0]
-SUBTASKS = '[subtasks]\ntopic = "/subtask"\n'
-SAID = ((0.41, "grasp the cup"), (0.7, "grasp the cup"), (1.013, "lift  the\tcup"), (1.5, ""), (2.2, "put it down"))
+SAID = {12: "grasp the cup", 30: "lift the cup", 41: "put it down"}
 
 
-def imported(notes: bags.Notes, mapping: str, folder: Path) -> int:
-    bag = bags.write_mcap(bags.in_order([*ARM, *notes]), folder / "bag.mcap")
-    path = bag_mappings.write_mapping(f"{MAPPING}\n{mapping}", folder / "robot.toml")
-    return exit_code("import", bag, "--mapping", path, "--out", folder / "run")
-
-
-def row_at(recording: Path, at_s: float) -> int:
-    """Index of the first frame at or after a time."""
-    with Recording(recording) as opened:
-        times = opened.table().time_ns
-    return next(row for row, time in enumerate(times.tolist()) if time >= bags.EPOCH_NS + round(at_s * bags.NS))
+def recorded(folder: Path, *episodes: dict[int, str]) -> Path:
+    """A run whose episodes have these subtasks, each at its first row."""
+    (folder / "run" / "episodes").mkdir(parents=True)
+    for index, subtasks in enumerate(episodes):
+        given = make_external(cameras=(), episode_index=index)
+        frames = [replace(frame, subtask=subtasks.get(row, "")) for row, frame in enumerate(given.frames)]
+        path = folder / "run" / "episodes" / f"episode_{index:06d}.mcap"
+        write_external(path, replace(given, frames=frames))
+    return folder / "run"
 
 
 def rows_of(dataset: Path) -> list[dict[str, Any]]:
@@ -51,8 +47,7 @@ def rows_of(dataset: Path) -> list[dict[str, Any]]:
 def test_other_language_of_a_dataset_is_left_out(
     change: dict[str, str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert imported(bags.texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
-    export(tmp_path / "run", tmp_path / "a", language=("subtask",))
+    export(recorded(tmp_path, SAID), tmp_path / "a", language=("subtask",))
     (file,) = sorted((tmp_path / "a" / "data").rglob("*.parquet"))
     table = pq.read_table(file)
     place = table.schema.get_field_index("language_persistent")
@@ -71,19 +66,14 @@ def test_other_language_of_a_dataset_is_left_out(
 
 @pytest.mark.usefixtures("without_lerobot")
 def test_a_dataset_has_exactly_the_recorded_subtasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert imported(bags.texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
-    (recording,) = recordings(tmp_path / "run")
-    begun = ((0.41, "grasp the cup"), (1.013, "lift the cup"), (2.2, "put it down"))
-    expected = [(row_at(recording, at), text) for at, text in begun]
-    with Recording(recording) as opened:
-        assert list(opened.subtasks) == expected
+    recorded(tmp_path, SAID)
     words = ("export", "lerobot", tmp_path / "run", "--out", tmp_path / "dataset", "--language", "subtask")
     assert exit_code(*words, "--no-verify") == 0
     assert "Nobody said" not in capsys.readouterr().out
     for row in rows_of(tmp_path / "dataset"):
         told = row["language_persistent"]
         assert [(entry["content"], entry["timestamp"]) for entry in told] == [
-            (text, float(np.float32(frame / 30))) for frame, text in expected
+            (text, float(np.float32(frame / 30))) for frame, text in SAID.items()
         ]
         assert {(entry["role"], entry["style"], entry["camera"]) for entry in told} == {("assistant", "subtask", None)}
         assert not row["language_events"]
@@ -92,8 +82,7 @@ def test_a_dataset_has_exactly_the_recorded_subtasks(tmp_path: Path, capsys: pyt
 
 
 def test_subtasks_are_shown_at_their_time(tmp_path: Path) -> None:
-    assert imported(bags.texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
-    (recording,) = recordings(tmp_path / "run")
+    (recording,) = recordings(recorded(tmp_path, SAID))
     with Recording(recording) as opened:
         times = opened.table().time_ns
         expected = [(int(times[frame] - times[0]) / 1e9, text) for frame, text in opened.subtasks]
@@ -111,23 +100,14 @@ def test_subtasks_are_shown_at_their_time(tmp_path: Path) -> None:
 
 
 def test_all_kinds_means_the_known_ones(tmp_path: Path) -> None:
-    assert imported(bags.texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
-    export(tmp_path / "run", tmp_path / "all", language=())
+    export(recorded(tmp_path, SAID), tmp_path / "all", language=())
     assert {entry["style"] for row in rows_of(tmp_path / "all") for entry in row["language_persistent"]} == {"subtask"}
     with pytest.raises(ConfigError, match="has only the subtasks"):
         export(tmp_path / "run", tmp_path / "plans", language=("subtask", "plan"))
 
 
-def test_markers_with_other_texts_are_subtasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = [(0.3, "start"), (0.5, "reach"), (1.2, "success"), (1.5, "start"), (2.4, "stop"), (2.6, "wave")]
-    text = '[episodes]\ncut = "marker"\ntopic = "/marker"\n[subtasks]\ntopic = "/marker"\n'
-    assert imported(bags.texts("/marker", said), text, tmp_path) == 0
-    first, second = recordings(tmp_path / "run")
-    with Recording(first) as opened:
-        assert [said for _, said in opened.subtasks] == ["reach"]
-    with Recording(second) as opened:
-        assert opened.subtasks == ()
-    capsys.readouterr()
+def test_episodes_without_subtasks_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recorded(tmp_path, SAID, {})
     words = ("export", "lerobot", tmp_path / "run", "--out", tmp_path / "dataset", "--language", "--no-verify")
     assert exit_code(*words) == 0
     told = "No subtasks are known, so none are written, for episode_000001.mcap."
@@ -138,9 +118,7 @@ def test_markers_with_other_texts_are_subtasks(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_subtasks_are_never_invented(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert imported([], "", tmp_path) == 0
-    words = ("export", "lerobot", tmp_path / "run", "--out", tmp_path / "dataset", "--language", "subtask")
-    capsys.readouterr()
+    words = ("export", "lerobot", recorded(tmp_path, {}), "--out", tmp_path / "dataset", "--language", "subtask")
     assert exit_code(*words, "--no-verify") == 2
     err = capsys.readouterr().err
     assert "no source specifies subtasks" in err
@@ -148,31 +126,7 @@ def test_subtasks_are_never_invented(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert not (tmp_path / "dataset").exists()
 
 
-FAULTS: dict[str, tuple[bags.Notes, str, int, str]] = {
-    "no text": ([], SUBTASKS.replace("/subtask", "/leader/joint_states") + 'field = "position"\n', 1, "is not a text"),
-    "another field": (
-        bags.texts("/subtask", SAID),
-        SUBTASKS + 'field = "data"\n[episodes]\ncut = "marker"\ntopic = "/subtask"\nfield = "x"\n', 2, "subtasks.field",
-    ),
-    "a control character": (bags.texts("/subtask", [(1.0, "a\x1b[2J")]), SUBTASKS, 1, "not a single line"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", sorted(FAULTS))
-def test_bad_input_is_refused(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    notes, mapping, code, told = FAULTS[name]
-    assert imported(notes, mapping, tmp_path) == code
-    *progress, sentence = capsys.readouterr().err.splitlines()
-    assert told in sentence
-    assert all(line.startswith("importing: ") for line in progress)  # of a busy machine
-    assert not recordings(tmp_path / "run")
-
-
 def test_recovery_keeps_subtasks(tmp_path: Path) -> None:
-    from dataclasses import replace
-
-    from support.external import make_external
-
     given = make_external(cameras=())
     with SampledWriter(tmp_path / "a.mcap", given.info) as writer:
         for number, frame in enumerate(given.frames):

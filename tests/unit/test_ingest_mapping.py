@@ -27,7 +27,7 @@ WRONG = [
     ('fps = 30', 'fps = "x"', r"'x' is not a whole number"),
     ('[robot]', '[episodes]\ncut = "service"\n[robot]', r"'service' is not one of 'file', 'marker'"),
     ('fps = 30', 'fps = 30\nmax_age_s = 0', r"clock.max_age_s is 0, it must be above 0"),
-    ('text = "stack the cups"', '', r"\[task\] needs one of text, topic and file_name"),
+    ('text = "stack the cups"', '', r"\[task\] needs one of text and file_name"),
     ('[features.action]', '[features.act]', r"missing feature 'action'"),
     ('[cameras.front]', '[cameras."a b"]', r"a camera is called 'a b', allowed are letters"),
     ('topic = "/leader/joint_states"', 'next = "observation.stat"', r"Did you mean 'observation.state'\?"),

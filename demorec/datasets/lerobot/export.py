@@ -180,8 +180,7 @@ class _Export:
         """Raise ConfigError if language is requested and a new dataset would have no statements."""
         if self._existing is None and self._options.language is not None and len(self._silent) == len(self._digests):
             raise ConfigError(
-                "These episodes have no language, since no source specifies subtasks "
-                "(in the mapping of an import, [subtasks] names their topic): leave --language out."
+                "These episodes have no language, since no source specifies subtasks: leave --language out."
             )
 
 

@@ -43,7 +43,7 @@ def write_bag(
             images.of(number),
             outcome=Outcome(success=episode.rows.window.success, num_frames=episode.rows.table.num_frames),
             video=settings.video,
-            subtasks=episode.subtasks,
+            subtasks={},
         )
         for number, episode in enumerate(episodes)
     ]

@@ -121,35 +121,18 @@ class Robot:
 
 @dataclass(frozen=True, kw_only=True)
 class TaskText:
-    """Instruction of the task; one of text, topic or attribute, and file_name.
+    """Instruction of the task: one of text, attribute and file_name.
 
     Attributes:
         text: Instruction of all episodes.
-        topic: Topic of instructions; the last one before the episode's end is used.
-        field: Field of the text in that topic's messages.
         attribute: Attribute of the HDF5 file's episode, or of a group above it; "ep_meta.lang" is the value `lang` of
         the JSON in `ep_meta`.
         file_name: Use the file's name: "stack_the_cups_003" becomes "stack the cups".
     """
 
     text: str = ""
-    topic: str = _bag("")
-    field: str = _bag("data")
     attribute: str = _hdf5("")
     file_name: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class Subtasks:
-    """Current subtask of the robot, in words; each text is valid from its message.
-
-    Attributes:
-        topic: Topic of the texts, possibly the markers' topic; "" for none.
-        field: Field of the text in that topic's messages.
-    """
-
-    topic: str = ""
-    field: str = "data"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +193,7 @@ class SourceMapping:
 
     Attributes:
         kind: Kind of its sources.
-        robot, task, subtasks, clock, episodes: See these classes.
+        robot, task, clock, episodes: See these classes.
         features: Name of a feature -> its sources, in order.
         cameras: Name of a camera -> its images.
     """
@@ -218,7 +201,6 @@ class SourceMapping:
     kind: SourceKind = "bag"
     robot: Robot
     task: TaskText
-    subtasks: Subtasks = dataclasses.field(default_factory=Subtasks, metadata=_BAG)
     clock: Clock = dataclasses.field(default_factory=Clock)
     episodes: Episodes = dataclasses.field(default_factory=Episodes)
     features: Mapping[str, tuple[Source, ...]] = dataclasses.field(default_factory=dict)

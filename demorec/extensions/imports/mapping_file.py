@@ -114,8 +114,8 @@ def _problems(mapping: SourceMapping) -> Iterator[str]:
             yield f"cameras.{name} needs a {what}"
         yield from _age_problems(f"cameras.{name}", camera.max_age_s)
     task, clock, episodes = mapping.task, mapping.clock, mapping.episodes
-    if (bool(task.text.strip()) + bool(task.topic or task.attribute) + task.file_name) != 1:
-        yield f"[task] needs one of text, {elsewhere} and file_name"
+    if (bool(task.text.strip()) + bool(task.attribute) + task.file_name) != 1:
+        yield f"[task] needs one of {'text' if is_bag else 'text, attribute'} and file_name"
     if mapping.robot.urdf and (mapping.robot.urdf_topic or mapping.robot.urdf_attribute):
         yield f"robot.urdf and robot.urdf_{elsewhere} are both given, one is enough"
     if not (clock.fps == 0 and not is_bag) and not 1 <= clock.fps <= MAX_FPS:
@@ -155,11 +155,8 @@ def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Itera
 
 
 def _bag_problems(mapping: SourceMapping) -> Iterator[str]:
-    task, clock, episodes = mapping.task, mapping.clock, mapping.episodes
+    clock, episodes = mapping.clock, mapping.episodes
     yield from _age_problems("clock", clock.max_age_s)
-    fields = {task.topic: task.field, **({episodes.topic: episodes.field} if episodes.cut == "marker" else {})}
-    if mapping.subtasks.topic and fields.get(mapping.subtasks.topic, mapping.subtasks.field) != mapping.subtasks.field:
-        yield f"subtasks.field is {mapping.subtasks.field!r}, but another field of the same topic is taken for texts"
     if episodes.cut == "marker" and not episodes.topic:
         yield 'episodes.cut = "marker" needs episodes.topic'
     if not 0 <= clock.max_trim_s <= MAX_SECONDS:

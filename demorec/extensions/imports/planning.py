@@ -27,7 +27,7 @@ from demorec.extensions.imports.mapping import Episodes, SourceMapping
 from demorec.extensions.imports.rows import EpisodeRows, NoRowsError, TakenImages, Timelines, Window
 from demorec.extensions.imports.streams import Text, read_streams
 from demorec.extensions.imports.words import stated_task
-from demorec.mcap.sampled_writer import MAX_STAMP_NS, MAX_SUBTASK
+from demorec.mcap.sampled_writer import MAX_STAMP_NS
 from demorec.mcap.video import size_problem
 from demorec.runs.external import differences
 
@@ -39,11 +39,10 @@ _MOST_LISTED = 5
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedEpisode:
-    """An episode to write; `subtasks` is row -> subtask that begins there, in words."""
+    """An episode to write."""
 
     info: EpisodeInfo
     rows: EpisodeRows
-    subtasks: Mapping[int, str]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,14 +140,14 @@ def _episode(
         info = imported_info(
             mapping,
             episode_index=index,
-            instruction=_task_text(bag.name, lines, rows.window),
+            instruction=stated_task(mapping.task, bag.name),
             urdf=urdf,
             fps=mapping.clock.fps,
             features=(_feature(name, values.dtype, lines) for name, values in rows.table.features.items()),
             cameras=(_camera(name, plan, lines) for name, plan in rows.cameras.items()),
             files=(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
         )
-        episode = PlannedEpisode(info=info, rows=rows, subtasks=_subtask_rows(lines, rows))
+        episode = PlannedEpisode(info=info, rows=rows)
         if wrong := list(_problems(episode, settings.video)):
             raise FieldError("; ".join(wrong))
     except FieldError as error:
@@ -165,8 +164,6 @@ def windows(lines: Timelines) -> list[Window]:
         return [Window(begin_ns=begin, end_ns=end)]
     markers = lines.streams.texts[episodes.topic]
     known = {True, False, "", *_words(episodes)}
-    if episodes.topic == lines.mapping.subtasks.topic:
-        known |= {marker.value for marker in markers if isinstance(marker.value, str)}
     if unknown := dict.fromkeys(repr(marker.value)[:_SHOWN] for marker in markers if marker.value not in known):
         raise BagError(
             f"The mapping does not list these markers of {episodes.topic}: {listed(unknown, _MOST_LISTED, ', ')}; put "
@@ -207,44 +204,6 @@ def _between_markers(markers: list[Text], words: Episodes) -> list[Window]:
         elif found and marker.value in words.discard:
             found[-1] = replace(found[-1], discarded=marker.value)
     return found
-
-
-def _task_text(bag_name: str, lines: Timelines, window: Window) -> str:
-    """Instruction of an episode; BagError if the bag does not have it."""
-    task = lines.mapping.task
-    if text := stated_task(task, bag_name):
-        return text
-    texts = [text for text in lines.streams.texts[task.topic] if text.time_ns <= window.end_ns]
-    if not texts:
-        raise BagError(f"No text of {task.topic} is before the episode's end, so its task is unknown")
-    value = max(texts, key=lambda text: text.time_ns).value
-    if not isinstance(value, str) or not value.strip():
-        raise BagError(f"The task of {task.topic} is not text")
-    return value.strip()
-
-
-def _subtask_rows(lines: Timelines, rows: EpisodeRows) -> dict[int, str]:
-    """Row -> subtask that begins there, from the texts of the mapping's topic within the episode.
-
-    Among several before a row, the last one is used; a repeated or empty text begins nothing.
-
-    Raises:
-        BagError: A message is not text.
-    """
-    episodes, topic = lines.mapping.episodes, lines.mapping.subtasks.topic
-    markers = _words(episodes) if episodes.cut == "marker" and episodes.topic == topic else set()
-    found: dict[int, str] = {}
-    for text in sorted(lines.streams.texts.get(topic, ()), key=lambda text: text.time_ns):
-        if not rows.window.begin_ns <= text.time_ns <= rows.table.time_ns[-1]:
-            continue
-        if not isinstance(text.value, str):
-            raise BagError(f"The subtask of {topic} is not text")
-        if text.value in markers:
-            continue
-        if said := " ".join(text.value.split()):
-            found[int(np.searchsorted(rows.table.time_ns, text.time_ns))] = said
-    before = ["", *found.values()]
-    return {row: said for (row, said), last in zip(found.items(), before, strict=False) if said != last}
 
 
 def _feature(name: str, dtype: DTypeLike, lines: Timelines) -> Feature:
@@ -289,8 +248,6 @@ def _problems(episode: PlannedEpisode, video: VideoConfig) -> Iterator[str]:
     for name, plan in episode.rows.cameras.items():
         if not plan.kept and (problem := size_problem(video, plan.head.width, plan.head.height)):
             yield f"camera {name}: {problem}"
-    if any(len(text) > MAX_SUBTASK or not text.isprintable() for text in episode.subtasks.values()):
-        yield f"a subtask is not a single line of at most {MAX_SUBTASK} characters"
     table = episode.rows.table
     for stamps in (table.time_ns, *table.stamps.values(), *table.image_stamps.values()):
         if len(stamps) and not 0 <= stamps.min() <= stamps.max() <= MAX_STAMP_NS:

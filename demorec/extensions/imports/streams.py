@@ -150,7 +150,7 @@ class Stream:
 
 
 class Text(NamedTuple):
-    """A text, number or boolean of a topic (task, marker, robot description), with its time by the mapping's clock."""
+    """A text, number or boolean of a topic (marker, robot description), with its time by the mapping's clock."""
 
     time_ns: int
     value: Any
@@ -188,8 +188,7 @@ class BagStreams:
         self._of_topic: dict[str, list[Stream]] = {}
         for stream in self.all.values():
             self._of_topic.setdefault(stream.topic, []).append(stream)
-        self._fields = {mapping.task.topic: mapping.task.field, mapping.robot.urdf_topic: "data"}
-        self._fields[mapping.subtasks.topic] = mapping.subtasks.field
+        self._fields = {mapping.robot.urdf_topic: "data"}
         if mapping.episodes.cut == "marker":
             self._fields[mapping.episodes.topic] = mapping.episodes.field
         self._fields.pop("", None)

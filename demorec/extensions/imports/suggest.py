@@ -42,7 +42,6 @@ _NO_JOINTS = re.compile(r"velocit|effort|torque|force|wrench|cartesian|(?<![a-z]
 _GRIPPER = re.compile(r"gripper|finger|jaw|knuckle")
 _ROBOT_POSE = re.compile(r"end_effector|(?<![a-z])(ee|eef|tcp|tool\d*|flange|hand|current|robot|arm)(?![a-z])")
 _SIDE = re.compile(r"(?<![a-z])(left|right|l|r|\d+)(?![a-z])")
-_TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
 _CAMERA_WORD = re.compile(r"[^a-z0-9]+")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
 _DEPTH_WORDS = {"depth", "aligned", "to", "compresseddepth", "registered"}
@@ -222,7 +221,7 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     model = min(models, key=lambda name: (name.count("/"), name), default="")  # nested ones may belong to objects
     lines += ["", "[robot]", f"name = {quoted(robot)}"]
     lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
-    lines += ["", "[task]", *_task(topics, bag)]
+    lines += ["", "[task]", *_task(bag)]
     lines += ["", "[clock]", *_clock(topics, cameras, [*state, *action])]
     lines += [*_sources("observation.state", state, topics), *_sources("action", action, topics)]
     if not action:
@@ -277,14 +276,11 @@ def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
     return cameras
 
 
-def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:
-    for name, topic in sorted(topics.items()):
-        if _TASK.search(name.lower()) and topic.first and isinstance(topic.first.get("data"), str):
-            return [f"topic = {quoted(name)}"]
+def _task(bag: Bag) -> list[str]:
     text = f"# text = {quoted('what the robot was asked to do')}  # the same for all bags"
     if name := task_in_name(bag.name):
         return [f"file_name = true  # the name of each bag is its task, here {quoted(name)}; or write:", text]
-    return ["# Neither a topic nor a file name describes the task. Write it here:", text]
+    return ["# The name of the bag does not describe the task. Write it here:", text]
 
 
 def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequence[_Part]) -> Iterator[str]:
