@@ -127,7 +127,6 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     from demorec.extensions.imports.fields import image_bytes
     from demorec.extensions.imports.image_messages import decode_image
     from demorec.extensions.imports.mapping_file import read_mapping
-    from demorec.extensions.imports.planning import windows
     from demorec.extensions.imports.rows import Timelines
     from demorec.extensions.imports.streams import read_streams
 
@@ -135,7 +134,7 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     opened = open_bag(bag)
     streams = read_streams(opened, known)
     lines = Timelines(streams, known)
-    rows = lines.rows(windows(lines)[0])
+    rows = lines.rows()
     features: dict[str, object] = {
         f"observation.images.{name}": {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": list(AXES)}
         for name in rows.cameras

@@ -28,8 +28,6 @@ from demorec.runs.run_file import load_any_run_file
 pytestmark = pytest.mark.slow
 
 FRONT = "/follower/cam_front/image_raw/compressed"
-DROPPING = bag_mappings.SO101.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
-"""`drop_episode` must not cover up an unreadable bag, which has no episode."""
 
 
 def _bag(path: Path, seconds: float = 0.6, change: Callable[[bags.Notes], bags.Notes] = lambda notes: notes) -> Path:
@@ -77,7 +75,7 @@ def _batch(folder: Path) -> tuple[Path, Path]:
     for number, (spoil, _) in enumerate(BAD.values()):
         _bag(folder / "bags" / f"run_{2 * number}.mcap", 0.5 + 0.1 * number)
         spoil(_bag(folder / "bags" / f"run_{2 * number + 1}.mcap"))
-    return folder / "bags", bag_mappings.write_mapping(DROPPING, folder / "robot.toml")
+    return folder / "bags", bag_mappings.write_mapping(bag_mappings.SO101, folder / "robot.toml")
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +169,7 @@ def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_agai
 def test_errors_other_than_bad_bags_stop_a_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A mistyped name, a full disk and too little memory stop the batch."""
     bag, run = _bag(tmp_path / "a.mcap"), tmp_path / "run"
-    mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
+    mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml")
     with pytest.raises(ConfigError, match="No readable bag"):
         import_bags([bag, tmp_path / "b.mcap"], mapping, run, skip_bad=True)
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -195,7 +193,7 @@ def test_the_same_bag_twice_is_imported_once(tmp_path: Path) -> None:
     copy = tmp_path / "copy" / "a.mcap"
     copy.parent.mkdir()
     copy.write_bytes(first.read_bytes())
-    mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
+    mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml")
     assert import_bags([first, first, copy], mapping, tmp_path / "run").num_new == 1
 
 
@@ -209,7 +207,7 @@ def test_a_folder_means_its_bags_in_natural_order(tmp_path: Path) -> None:
     (folder / "run_3" / "metadata.yaml").unlink()  # as after a crash of the recorder
     (folder / "notes.txt").write_text("Tuesday")
     (folder / "photos").mkdir()
-    mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
+    mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml")
     result = import_bags([folder], mapping, tmp_path / "run")
     assert [report.name for report in result.reports] == ["run_1", "run_2", "run_3.mcap", "run_10.bag"]
     assert exit_code("import", "--suggest", folder) == 0
@@ -232,7 +230,7 @@ def test_flags_of_other_sources_are_refused(
 def test_bags_before_a_bad_one_are_imported(workers: int, tmp_path: Path) -> None:
     good = [_bag(tmp_path / f"{number}.mcap", 0.5 + 0.1 * number) for number in range(3)]
     good[1].write_bytes(b"")
-    mapping, run = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml"), tmp_path / "run"
+    mapping, run = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml"), tmp_path / "run"
     with pytest.raises(BagError, match="The bag is empty"):
         import_bags(good, mapping, run, workers=workers)
     assert [path.name for path in run.glob("episodes/*")] == ["episode_000000.mcap"]

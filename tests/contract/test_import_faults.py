@@ -92,15 +92,3 @@ def test_check_reads_the_report(kind: str, notes: bags.Notes, tmp_path: Path) ->
     assert found.verdict == ("look" if name else "good")
     assert any(kind in finding.message for finding in found.findings) == bool(name)
     assert result_of(tmp_path / "run", "import_dropped", "run").verdict == "good"
-
-
-def test_dropped_episodes_are_reported(notes: bags.Notes, tmp_path: Path) -> None:
-    marks = bags.texts("/episode", [(0.1, "start"), (0.6, "stop"), (0.61, "start"), (1.3, "stop")])
-    bag = bags.write_mcap(bags.in_order([*hurt(notes, "a long pause"), *marks]), tmp_path / "bag.mcap")
-    cut = '[episodes]\ncut = "marker"\ntopic = "/episode"\n'
-    text = MAPPING.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
-    text = text.replace("[cameras.front]", cut + "[cameras.front]")
-    import_bags([bag], bag_mappings.write_mapping(text, tmp_path / "robot.toml"), tmp_path / "run")
-    result = result_of(tmp_path / "run", "import_dropped", "run")
-    assert (result.verdict, result.findings[0].value) == ("look", "1")
-    assert "camera front" in result.findings[0].message

@@ -112,12 +112,6 @@ def messages(
     ]
 
 
-def texts(topic: str, said: Sequence[tuple[float, str]]) -> Notes:
-    """Messages of std_msgs/String, which has no header, at seconds after `EPOCH_NS`."""
-    words = {EPOCH_NS + round(at_s * NS): text for at_s, text in said}
-    return messages(topic, "std_msgs/msg/String", list(words), lambda time: {"data": words[time]}, has_header=False)
-
-
 def joints(
     topic: str, names: Sequence[str], moments: Sequence[int], *, shift: float = 0.0, latency_ns: int = 500_000
 ) -> Notes:

@@ -64,9 +64,6 @@ _YAML = (
 MAPPING = (
     bag_mappings.HEAD.format(robot="r")
     + """
-[episodes]
-cut = "marker"
-topic = "/text"
 [[features."observation.state"]]
 topic = "/joints"
 field = "position"
@@ -177,14 +174,14 @@ class Fuzzed:
         return self._imported(bag, bag_mappings.SO101, chance)
 
     def _mapping(self, chance: random.Random) -> Words:
-        keys = chance.choice(("", "max_trim_s = 1\n", 'rows = "grid"\n', 'stamp = "log"\n', 'when_old = "error"\n'))
+        keys = chance.choice(("", "max_trim_s = 1\n", 'rows = "grid"\n', 'stamp = "log"\n'))
         text = MAPPING.replace("fps = 30\n", f"fps = 30\n{keys}")
         return self._imported(
             self._json_bag(lambda topic, values: None), _changed_lines(text, "= ", _TOML, chance), chance
         )
 
     def _messages(self, chance: random.Random) -> Words:
-        wanted = chance.choice(("/joints", "/image", "/text"))
+        wanted = chance.choice(("/joints", "/image"))
 
         def change(topic: str, values: Any) -> None:
             if topic == wanted and chance.random() < 0.7:
@@ -199,13 +196,12 @@ class Fuzzed:
         with path.open("wb") as file:
             writer = Writer(file)
             writer.start()
-            channels = {name: writer.register_channel(name, "json", 0) for name in ("/joints", "/image", "/text")}
+            channels = {name: writer.register_channel(name, "json", 0) for name in ("/joints", "/image")}
             for number in range(12):
                 moment = bags.EPOCH_NS + number * bags.NS // 30
                 for name, fields in (
                     ("/joints", {"name": ["a", "b"], "position": [0.1 * number, 0.2]}),
                     ("/image", {"encoding": "rgb8", "width": bags.WIDTH, "height": bags.HEIGHT, "data": pixels}),
-                    ("/text", {"data": ("start", "stop")[number // 6]}),
                 ):
                     values = {"header": {"stamp": {"sec": moment // bags.NS, "nsec": moment % bags.NS}}, **fields}
                     change(name, values)
@@ -228,7 +224,7 @@ class Fuzzed:
         notes = bags.joints("/joints", ("a", "b"), bags.times(50, 0.3))
         notes += bags.messages("/image", kind, bags.times(30, 0.3), body)
         bag = bags.write_mcap(bags.in_order(notes), self.folder / "image.mcap")
-        return self._imported(bag, MAPPING.replace('[episodes]\ncut = "marker"\ntopic = "/text"\n', ""), chance)
+        return self._imported(bag, MAPPING, chance)
 
     def _dataset(self, chance: random.Random) -> Words:
         root = self.folder / "dataset"

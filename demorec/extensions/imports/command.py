@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from demorec.extensions.imports.episode_writer import FramesImport
     from demorec.extensions.imports.import_file import BagReport
 
-_BAGS = "Bags; each is one episode, or several by the mapping."
+_BAGS = "Bags; each is one episode."
 BAGS = reader_rows()["rosbag"]
 _FORMATS = {row.word: row for row in reader_rows().values() if row.word}
 _WORDS = ", ".join(f"{word} ({form.plural})" for word, form in _FORMATS.items())
@@ -32,10 +32,9 @@ _WORDS = ", ".join(f"{word} ({form.plural})" for word, form in _FORMATS.items())
 class Import:
     """Convert another robot's bags (MCAP, rosbag2, ROS 1; without ROS), HDF5 files or LeRobot dataset to a run.
 
-    A mapping (TOML) maps topics to features; --suggest writes one from a bag's content. Every row holds messages of the
-    bag and records their age; missing or outdated data is an error or drops the episode, depending on the mapping.
-    Encoded images pass through. Run the same command again to continue. A folder without metadata.yaml means the bags
-    in it.
+    A mapping (TOML) maps topics to features; --suggest writes one from a bag's content. Each bag is one episode. Every
+    row holds messages of the bag and records their age; missing or outdated data is an error. Encoded images pass
+    through. Run the same command again to continue. A folder without metadata.yaml means the bags in it.
 
     A LeRobot dataset (v3.0, v2.1 or v2.0, from any writer) needs no mapping: its features keep their names, its numbers
     stay bit-exact, and its video packets pass through if each episode begins with a keyframe. With --motor-units its
@@ -160,10 +159,8 @@ class Import:
             )
         if result.num_new < len(result.reports):
             tell(f"{len(result.reports) - result.num_new} of {len(result.reports)} bags had been imported before.")
-        num_dropped = sum(len(report.episodes) - len(report.made) for report in result.reports)
-        num_frames = sum(episode.num_frames for report in result.reports for episode in report.made)
-        dropped = f", {num_dropped} dropped" if num_dropped else ""
-        say(f"{counted(result.num_episodes, 'episode')}, {num_frames} frames{dropped}: {out}")
+        num_frames = sum(report.num_frames for report in result.reports)
+        say(f"{counted(result.num_episodes, 'episode')}, {num_frames} frames: {out}")
         kinds = [finding.kind for report in result.reports for finding in report.odd]
         listed = f"{counted(len(kinds), 'finding')} in the bags ({', '.join(sorted(set(kinds)))})"
         has_notes = len(kinds) < sum(len(report.findings) for report in result.reports)
@@ -173,12 +170,12 @@ class Import:
 
 
 def _report_lines(report: BagReport) -> list[str]:
-    """Describe a bag: a table of its streams, its findings, its episodes."""
+    """Describe a bag: a table of its streams, its findings, its episode."""
     lines = aligned([tuple(report.streams[0]), *(tuple(stream.values()) for stream in report.streams)])
     for finding in report.findings:
         place = f"{finding.stream}: " if finding.stream else ""
         lines.append(f"{finding.kind}: {place}{finding.text}")
-    lines += [line for episode in report.episodes for line in episode.lines()]
+    lines += report.episode_lines()
     return [f"{report.name} ({size_in_words(report.num_bytes)})", *(f"  {line}" for line in lines)]
 
 

@@ -1,4 +1,4 @@
-"""Output of `demorec info` about bags and HDF5 files, and about the bags and episodes that an import left out."""
+"""Output of `demorec info` about bags and HDF5 files, and about the bags that an import left out."""
 
 from __future__ import annotations
 
@@ -82,13 +82,7 @@ def describe_hdf5(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def dropped_rows(path: Path) -> list[dict[str, str]]:
-    """Data that an import left out of the run: dropped episodes and skipped bags, each with its reason."""
-    if (imported := load_import_file(path)) is None:
-        return []
-    dropped = [
-        {"bag": bag.name, "what": f"episode from {row.begin_s:.2f} to {row.end_s:.2f} s", "reason": row.reason}
-        for bag in imported.bags
-        for row in bag.episodes
-        if row.episode_index is None
-    ]
-    return dropped + [{"bag": bag.name, "what": "the bag", "reason": bag.reason} for bag in imported.skipped]
+    """Bags that an import left out of the run, each with its reason."""
+    imported = load_import_file(path)
+    skipped = imported.skipped if imported else ()
+    return [{"bag": bag.name, "what": "the bag", "reason": bag.reason} for bag in skipped]

@@ -52,7 +52,7 @@ def bag_findings(bag: Timelines) -> tuple[ImportFinding, ...]:
     if not _have_another_epoch(lines):
         found += [finding for line in lines for finding in _skew_findings(line)]
     found += [ImportFinding(kind="cut_off", stream="", text=problem) for problem in bag.streams.problems]
-    found += [*_extent_findings(lines), *_clock_findings(bag, lines), *_still_findings(lines)]
+    found += [*_extent_findings(lines), *_clock_findings(lines), *_still_findings(lines)]
     once: dict[tuple[str, str], ImportFinding] = {}
     for finding in found:  # features that share a topic also share its findings
         once.setdefault((finding.kind, finding.text), finding)
@@ -132,7 +132,7 @@ def _have_another_epoch(lines: Sequence[Timeline]) -> bool:
     return bool(known) and all(abs(np.median(line.skews_ns)) >= _EPOCH_S * NS for line in known)
 
 
-def _clock_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
+def _clock_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
     """Streams with another clock than most, and log times next to header times of another clock."""
     skews = {line: float(np.median(line.skews_ns)) / NS for line in lines if len(line.skews_ns)}
     if not skews:
@@ -153,9 +153,6 @@ def _clock_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Impor
     text = f'is on times of recording, {usual:+.3f} s from the headers of the other streams: set clock.stamp = "log"'
     for line in (line for line in lines if not line.is_header):
         yield _of(line, "clock_offset", text)
-    for topic, texts in bag.streams.texts.items():
-        if topic != bag.mapping.robot.urdf_topic and not all(each.is_header for each in texts):
-            yield ImportFinding(kind="clock_offset", stream=topic, text=f"{topic}: {text}")
 
 
 def _extent_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
@@ -188,39 +185,34 @@ def _moves(line: Timeline) -> bool:
     return bool((np.ptp(values, axis=0) > noise).any())
 
 
-def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[ImportFinding]:
-    """Findings about the rows of a bag's episodes."""
-    if not episodes:
-        return
-    fps, follows = lines.mapping.clock.fps, next((rows.follows for rows in episodes if rows.follows), "")
-    steps = np.concatenate([np.diff(rows.table.time_ns) for rows in episodes])
-    if follows and len(steps):
+def row_findings(lines: Timelines, rows: EpisodeRows) -> Iterator[ImportFinding]:
+    """Findings about the rows of a bag's episode."""
+    fps, times_ns = lines.mapping.clock.fps, rows.table.time_ns
+    steps = np.diff(times_ns)
+    if rows.follows and len(steps):
         rate = NS / float(steps[steps <= _LOST * np.median(steps)].mean())
         if abs(rate - fps) > RATE * fps:
             text = f"rows follow its messages, {rate:.1f} a second, but fps is {fps}"
-            yield ImportFinding(kind="fps", stream=follows, text=text)
+            yield ImportFinding(kind="fps", stream=rows.follows, text=text)
     for line in lines.lines.values():
         if line.stream.heads:
-            yield from _use_findings(line, episodes, fps, follows)
+            yield from _use_findings(line, times_ns, fps, rows.follows)
 
 
-def _use_findings(line: Timeline, episodes: Sequence[EpisodeRows], fps: int, follows: str) -> Iterator[ImportFinding]:
+def _use_findings(line: Timeline, rows_ns: Int, fps: int, follows: str) -> Iterator[ImportFinding]:
     """Rows that repeat an image, and images in no row, if other rows would lose fewer."""
-    num_rows = num_repeated = num_free = num_images = num_skipped = 0
-    for rows in episodes:
-        index = line.chosen(rows.table.time_ns).index
-        steps = np.diff(index)
-        num_rows += len(index)
-        num_images += int(np.ptp(index)) + 1
-        num_skipped += int(np.maximum(steps - 1, 0).sum())
-        num_repeated += int((steps == 0).sum())
-        # A row may repeat an image if the next one is lost, or at the stream's end, or once at an episode's edge.
-        again = index[1:][steps == 0]
-        again = again[again < len(line.times_ns) - 1]
-        waits = line.times_ns[again + 1] - line.times_ns[again]
-        num_free += max(0, int(np.sum(waits <= _LOST * line.period_ns)) - 1)
+    index = line.chosen(rows_ns).index
+    steps = np.diff(index)
+    num_images = int(np.ptp(index)) + 1
+    num_skipped = int(np.maximum(steps - 1, 0).sum())
+    # A row may repeat an image if the next one is lost, or at the stream's end, or once at the episode's edge.
+    again = index[1:][steps == 0]
+    num_repeated = len(again)
+    again = again[again < len(line.times_ns) - 1]
+    waits = line.times_ns[again + 1] - line.times_ns[again]
+    num_free = max(0, int(np.sum(waits <= _LOST * line.period_ns)) - 1)
     rate = NS / max(line.period_ns, 1)
-    repeats = f"{100 * num_repeated / num_rows:.3g} % of the rows repeat its image"
+    repeats = f"{100 * num_repeated / len(index):.3g} % of the rows repeat its image"
     skips = f"{100 * num_skipped / num_images:.3g} % of its images are in no row"
     advice = f"use fps = {max(1, round(rate))}"
     if num_free and num_skipped:
@@ -229,7 +221,7 @@ def _use_findings(line: Timeline, episodes: Sequence[EpisodeRows], fps: int, fol
         yield _of(line, "repeats", f"{repeats} and {skips}: {advice if is_other_rate else uneven}")
     elif follows:
         return  # the images of a camera that has another rate than the one that rows follow
-    elif num_free > RATE * num_rows:
+    elif num_free > RATE * len(index):
         yield _of(line, "repeats", f"{repeats}: {advice}")
     elif num_skipped > RATE * num_images and abs(rate / fps - round(rate / fps)) > RATE:
         yield _of(line, "skips", f"{skips}: {advice}")  # taking every second image can be intended

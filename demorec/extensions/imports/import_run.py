@@ -1,4 +1,4 @@
-"""Import of bags to a run: every bag is read and judged as a whole, and only then written, episode by episode.
+"""Import of bags to a run: every bag is read and judged as a whole, and only then written, as one episode.
 
 The same command continues: bags in import.json are not imported again, existing episodes are not written again. Several
 processes may read and write; bags are numbered and added to the run in order.
@@ -59,29 +59,30 @@ class BagsImport:
     @property
     def num_episodes(self) -> int:
         """Number of episodes from the bags."""
-        return sum(len(report.made) for report in self.reports)
+        return len(self.reports)
 
     def left_out_lines(self) -> Iterator[str]:
-        """Describe dropped parts and findings."""
-        yield from (f"{report.name}: {line}" for report in self.reports for line in report.dropped_lines())
+        """Describe findings."""
+        for report in self.reports:
+            if kinds := sorted({finding.kind for finding in report.odd}):
+                yield f"{report.name}: findings in the bag ({', '.join(kinds)}), which demorec check lists"
 
     def accepted(
         self, bags: Iterable[tuple[Path, _Read]], folder: ExternalFolder, *, skip_bad: bool
     ) -> Iterator[PlannedBag | None]:
-        """Yield each bag with the numbers of its episodes; None for one that is in the run or is skipped.
+        """Yield each bag with the number of its episode; None for one that is in the run or is skipped.
 
         Raises:
             BagError, ConfigError: It cannot be read, or does not fit the mapping or the run.
         """
-        kind, next_index = folder.kind(), self.known.num_episodes
+        kind, index = folder.kind(), len(self.known.bags)
         for path, read in bags:
             new = None
             try:
                 files, planned = read()
-                new = planned.numbered(next_index) if planned and files not in self.files.values() else None
-                if new and new.episodes:
-                    kind = kind or new.episodes[0].info
-                    if different := differences(kind, new.episodes[0].info):
+                if planned and files not in self.files.values():
+                    new, kind = planned.numbered(index), kind or planned.info
+                    if different := differences(kind, planned.info):
                         raise ConfigError(
                             f"The run's episodes differ from the bag's ({'; '.join(different)}): import it into "
                             f"another folder: {path}"
@@ -90,9 +91,9 @@ class BagsImport:
             except Exception as error:
                 new = None
                 self.skipped[path] = _why_skipped(path, error, is_allowed=skip_bad)
-            if new and new.episodes:
-                folder.begin(new.episodes[0].info)
-                next_index += len(new.episodes)
+            if new:
+                folder.begin(new.info)
+                index += 1
             yield new
 
     def add(self, report: BagReport, lines: Sequence[Attempt], folder: ExternalFolder) -> None:
@@ -125,7 +126,7 @@ def import_bags(
     """Import bags to a run, by a mapping.
 
     Args:
-        paths: Bags, each of which is one episode or several by the mapping; or folders of bags.
+        paths: Bags, each of which is one episode; or folders of bags.
         out: The run's folder; a run started with the same mapping is continued.
         video: Encoding of images that arrive as pixels.
         workers: Number of processes that read and write; the recordings do not depend on it.
@@ -154,8 +155,8 @@ def import_bags(
         folder.planned = [path.name for path in given]
 
         def write(planned: PlannedBag | None) -> Callable[[], list[Attempt]]:
-            missing = [one for one in planned.episodes if not folder.has(one.info)] if planned else []
-            return start(write_bag, planned, missing, folder.path, settings) if planned else list
+            is_missing = planned and not folder.has(planned.info)
+            return start(write_bag, planned, folder.path, settings) if is_missing else list
 
         read = _in_order(lambda path: start(_read, path, done, settings), given, workers)
         accepted = batch.accepted(read, folder, skip_bad=skip_bad)

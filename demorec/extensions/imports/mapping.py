@@ -145,7 +145,6 @@ class Clock:
         any, a grid); "grid": evenly spaced.
         stamp: Whether a message's time is its header time or its log time.
         max_age_s: Maximum age of a message at its row, which takes the last one before it.
-        when_old: Treatment of messages that are older or missing.
         max_trim_s: Maximum time to leave out at the bag's beginning and end if a stream starts late or ends early.
     """
 
@@ -153,38 +152,22 @@ class Clock:
     rows: Literal["camera", "grid"] = _bag("camera")
     stamp: Literal["header", "log"] = _bag("header")
     max_age_s: float = _bag(0.2)
-    when_old: Literal["error", "drop_episode"] = _bag("error")
     max_trim_s: float = _bag(1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Episodes:
-    """Boundaries of episodes.
+    """Episodes of an HDF5 file; a bag is one episode.
 
     Attributes:
-        cut: Whether a whole bag is one episode, or markers split it.
-        topic: Topic of the markers.
-        field: Field of the text, number or boolean in a marker.
-        start, stop: Texts of markers that begin and end an episode (text only; a boolean does both).
-        success, failure: Marker texts for the outcome. For HDF5 files, success is a boolean attribute of the episode,
-        or a dataset with a last row above 0 for success.
-        discard: Marker texts that discard the current episode or, between episodes, the previous one.
-        ignore: Marker texts without a meaning; other unknown texts are errors.
-        group: Group of an HDF5 file in which each group is an episode, "/" for the root; "" if the file itself is one.
+        group: Group in which each group is an episode, "/" for the root; "" if the file itself is one.
         mask: Use only the episodes listed in this dataset of `mask`.
+        success: Boolean attribute of the episode, or a dataset with a last row above 0 for success; "" if unknown.
     """
 
-    cut: Literal["file", "marker"] = _bag("file")
-    topic: str = _bag("")
-    field: str = _bag("data")
-    start: str = _bag("start")
-    stop: str = _bag("stop")
-    success: str = "success"
-    failure: str = _bag("failure")
-    discard: tuple[str, ...] = _bag(("discard",))
-    ignore: tuple[str, ...] = _bag(())
-    group: str = _hdf5("")
-    mask: str = _hdf5("")
+    group: str = ""
+    mask: str = ""
+    success: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,7 +185,7 @@ class SourceMapping:
     robot: Robot
     task: TaskText
     clock: Clock = dataclasses.field(default_factory=Clock)
-    episodes: Episodes = dataclasses.field(default_factory=Episodes)
+    episodes: Episodes = dataclasses.field(default_factory=Episodes, metadata=_HDF5)
     features: Mapping[str, tuple[Source, ...]] = dataclasses.field(default_factory=dict)
     cameras: Mapping[str, CameraSource] = dataclasses.field(default_factory=dict)
 

@@ -53,9 +53,6 @@ def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
                 raise ConfigError(f"This is a mapping of {_KINDS[other]}, not of {_KINDS[kind]}: {path}")
         raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
     try:
-        if kind == "hdf5" and isinstance(data.get("episodes", {}), dict):
-            # Success is read only if the mapping names its source.
-            data["episodes"] = {"success": ""} | data.get("episodes", {})
         mapping = from_plain({**data, KIND: kind}, SourceMapping)
     except ValueError as error:
         raise ConfigError(f"The mapping cannot be used: {error}: {path}") from error
@@ -120,7 +117,9 @@ def _problems(mapping: SourceMapping) -> Iterator[str]:
         yield f"robot.urdf and robot.urdf_{elsewhere} are both given, one is enough"
     if not (clock.fps == 0 and not is_bag) and not 1 <= clock.fps <= MAX_FPS:
         yield f"clock.fps is {clock.fps}, allowed are 1 to {MAX_FPS}"
-    yield from _bag_problems(mapping) if is_bag else ()
+    yield from _age_problems("clock", clock.max_age_s)
+    if not 0 <= clock.max_trim_s <= MAX_SECONDS:
+        yield f"clock.max_trim_s is {clock.max_trim_s:g}, it must be 0 to {MAX_SECONDS:g}"
     if episodes.mask and not episodes.group:
         yield "episodes.mask chooses among the episodes of a group, but episodes.group is empty"
 
@@ -152,15 +151,6 @@ def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Itera
     if source.joints and source.elements:
         yield f"{place} picks elements of {source.topic} both by joints and by elements"
     yield from _age_problems(place, source.max_age_s)
-
-
-def _bag_problems(mapping: SourceMapping) -> Iterator[str]:
-    clock, episodes = mapping.clock, mapping.episodes
-    yield from _age_problems("clock", clock.max_age_s)
-    if episodes.cut == "marker" and not episodes.topic:
-        yield 'episodes.cut = "marker" needs episodes.topic'
-    if not 0 <= clock.max_trim_s <= MAX_SECONDS:
-        yield f"clock.max_trim_s is {clock.max_trim_s:g}, it must be 0 to {MAX_SECONDS:g}"
 
 
 def _age_problems(place: str, age: float | None) -> Iterator[str]:

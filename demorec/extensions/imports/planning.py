@@ -1,7 +1,4 @@
-"""Read and judge a bag as a whole: plan the episodes to record, and report all findings.
-
-The mapping defines the boundaries, tasks and outcomes of episodes by the bag's content.
-"""
+"""Read and judge a bag as a whole: plan its episode, and report all findings."""
 
 from __future__ import annotations
 
@@ -13,8 +10,6 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError
-from demorec.core.plain import listed
 from demorec.episode.info import Camera, EpisodeInfo, Feature, SourceFile
 from demorec.episode.validity import find_problems
 from demorec.extensions.imports.bag import NS, Bag, Files
@@ -22,48 +17,28 @@ from demorec.extensions.imports.bag_files import BagError
 from demorec.extensions.imports.description import imported_feature, imported_info
 from demorec.extensions.imports.fields import FieldError
 from demorec.extensions.imports.findings import ImportFinding, bag_findings, row_findings
-from demorec.extensions.imports.import_file import BagReport, EpisodeReport, stream_figures
-from demorec.extensions.imports.mapping import Episodes, SourceMapping
-from demorec.extensions.imports.rows import EpisodeRows, NoRowsError, TakenImages, Timelines, Window
-from demorec.extensions.imports.streams import Text, read_streams
+from demorec.extensions.imports.import_file import BagReport, stream_figures
+from demorec.extensions.imports.mapping import SourceMapping
+from demorec.extensions.imports.rows import EpisodeRows, TakenImages, Timelines
+from demorec.extensions.imports.streams import read_streams
 from demorec.extensions.imports.words import stated_task
 from demorec.mcap.sampled_writer import MAX_STAMP_NS
 from demorec.mcap.video import size_problem
-from demorec.runs.external import differences
-
-_SHOWN = 40
-"""Maximum characters of a marker in an error."""
-_MOST_LISTED = 5
-"""Maximum number of markers in an error."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlannedEpisode:
-    """An episode to write."""
-
-    info: EpisodeInfo
-    rows: EpisodeRows
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedBag:
-    """A bag that has been read."""
+    """A bag that has been read, and its episode."""
 
     bag: Bag
     report: BagReport
-    episodes: tuple[PlannedEpisode, ...]
+    info: EpisodeInfo
+    rows: EpisodeRows
 
-    def numbered(self, first: int) -> PlannedBag:
-        """Renumber the episodes for a run."""
-        reports = (
-            replace(row, episode_index=None if row.episode_index is None else row.episode_index + first)
-            for row in self.report.episodes
-        )
-        episodes = (
-            replace(episode, info=replace(episode.info, episode_index=episode.info.episode_index + first))
-            for episode in self.episodes
-        )
-        return replace(self, report=replace(self.report, episodes=tuple(reports)), episodes=tuple(episodes))
+    def numbered(self, episode_index: int) -> PlannedBag:
+        """Renumber the episode for a run."""
+        report = replace(self.report, episode_index=episode_index)
+        return replace(self, report=report, info=replace(self.info, episode_index=episode_index))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,47 +51,37 @@ class ImportSettings:
 
 
 def plan_bag(bag: Bag, files: Files, settings: ImportSettings) -> PlannedBag:
-    """Read and judge a bag; its episodes are numbered from 0.
+    """Read and judge a bag; its episode has the number 0.
 
     Raises:
         BagError: It cannot be read, does not fit the mapping, or would yield an incomplete episode.
-        ConfigError: Its episodes differ.
     """
-    mapping = settings.mapping
-    streams = read_streams(bag, mapping)
+    streams = read_streams(bag, settings.mapping)
     try:
-        lines = Timelines(streams, mapping)
+        lines = Timelines(streams, settings.mapping)
         findings = bag_findings(lines)
-        begin = min(int(line.times_ns[0]) for line in lines.lines.values())
-        episodes: list[PlannedEpisode] = []
-        reports: list[EpisodeReport] = []
-        for window in windows(lines):
-            episode, reason = None, f"its marker is {window.discarded!r}" if window.discarded else ""
-            try:
-                if not window.discarded:
-                    rows = lines.rows(window)
-                    episode = _episode(bag, files, lines, rows, settings, len(episodes))
-                    episodes.append(episode)
-            except NoRowsError as error:
-                if mapping.clock.when_old == "error":
-                    raise BagError(f"The bag yields no complete episode: {error}{_reported(findings)}") from error
-                reason = str(error)
-            reports.append(_report(window, begin, episode, reason))
-        for episode in episodes:
-            if different := differences(episodes[0].info, episode.info):
-                raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {bag.path}")
+        try:
+            rows = lines.rows()
+        except BagError as error:
+            raise BagError(f"The bag yields no complete episode: {error}{_reported(findings)}") from error
+        info = _info(bag, files, lines, rows, settings)
     except BagError as error:
         raise BagError(f"{error}: {bag.path}") from error
-    rows_of = [episode.rows for episode in episodes]
+    times_ns, begin_ns = rows.table.time_ns, lines.begin_ns
     report = BagReport(
         name=bag.path.name,
         files=files,
         num_bytes=bag.num_bytes,
-        streams=tuple(stream_figures(line, rows_of) for line in lines.lines.values()),
-        findings=(*findings, *row_findings(lines, rows_of)),
-        episodes=tuple(reports),
+        streams=tuple(stream_figures(line, times_ns) for line in lines.lines.values()),
+        findings=(*findings, *row_findings(lines, rows)),
+        episode_index=0,
+        begin_s=(int(times_ns[0]) - begin_ns) / NS,
+        end_s=(int(times_ns[-1]) - begin_ns) / NS,
+        num_frames=len(times_ns),
+        pictures={name: images.described() for name, images in rows.cameras.items()},
+        follows=rows.follows,
     )
-    return PlannedBag(bag=bag, report=report, episodes=tuple(episodes))
+    return PlannedBag(bag=bag, report=report, info=info, rows=rows)
 
 
 def _reported(findings: Sequence[ImportFinding]) -> str:
@@ -126,20 +91,17 @@ def _reported(findings: Sequence[ImportFinding]) -> str:
     return f" (the bag's report: {'; '.join(kinds)})" if kinds else ""
 
 
-def _episode(
-    bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, settings: ImportSettings, index: int
-) -> PlannedEpisode:
-    """Describe an episode; BagError if it cannot be recorded, before anything of the bag is written."""
-    mapping, urdf = lines.mapping, settings.urdf
+def _info(bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, settings: ImportSettings) -> EpisodeInfo:
+    """Describe the episode; BagError if it cannot be recorded, before anything of the bag is written."""
+    mapping, urdf = settings.mapping, settings.urdf
     if topic := mapping.robot.urdf_topic:
-        texts = lines.streams.texts[topic]
-        urdf = texts[0].value if texts else ""
+        urdf = lines.streams.urdf
         if not isinstance(urdf, str) or not urdf.strip():
             raise BagError(f"{topic} holds no robot description")
     try:
         info = imported_info(
             mapping,
-            episode_index=index,
+            episode_index=0,
             instruction=stated_task(mapping.task, bag.name),
             urdf=urdf,
             fps=mapping.clock.fps,
@@ -147,63 +109,11 @@ def _episode(
             cameras=(_camera(name, plan, lines) for name, plan in rows.cameras.items()),
             files=(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
         )
-        episode = PlannedEpisode(info=info, rows=rows)
-        if wrong := list(_problems(episode, settings.video)):
+        if wrong := list(_problems(info, rows, settings.video)):
             raise FieldError("; ".join(wrong))
     except FieldError as error:
         raise BagError(f"The episode cannot be recorded: {error}") from error
-    return episode
-
-
-def windows(lines: Timelines) -> list[Window]:
-    """Episodes of a bag, in order; BagError if it has none, or a marker has no meaning."""
-    begin = min(int(line.times_ns[0]) for line in lines.lines.values())
-    end = max(int(line.times_ns[-1]) for line in lines.lines.values())
-    episodes = lines.mapping.episodes
-    if episodes.cut == "file":
-        return [Window(begin_ns=begin, end_ns=end)]
-    markers = lines.streams.texts[episodes.topic]
-    known = {True, False, "", *_words(episodes)}
-    if unknown := dict.fromkeys(repr(marker.value)[:_SHOWN] for marker in markers if marker.value not in known):
-        raise BagError(
-            f"The mapping does not list these markers of {episodes.topic}: {listed(unknown, _MOST_LISTED, ', ')}; put "
-            "each into episodes.discard (the episode is left out) or episodes.ignore, or set start, stop, success or "
-            "failure"
-        )
-    if found := _between_markers(markers, episodes):
-        return found
-    raise BagError(
-        f"No marker {episodes.start!r} of {episodes.topic} is followed by {episodes.stop!r}, so there is no episode"
-    )
-
-
-def _words(episodes: Episodes) -> set[str]:
-    """Texts of markers with a meaning."""
-    words = (episodes.start, episodes.stop, episodes.success, episodes.failure)
-    return {*words, *episodes.discard, *episodes.ignore}
-
-
-def _between_markers(markers: list[Text], words: Episodes) -> list[Window]:
-    found: list[Window] = []
-    begin: int | None = None
-    for marker in sorted(markers, key=lambda marker: marker.time_ns):
-        if marker.value is True or marker.value == words.start:
-            begin = marker.time_ns
-        elif begin is not None and (
-            marker.value is False or marker.value in (words.stop, words.success, words.failure)
-        ):
-            success = {words.success: True, words.failure: False}.get(marker.value) if marker.value else None
-            found.append(Window(begin_ns=begin, end_ns=marker.time_ns, success=success))
-            begin = None
-        elif begin is None and found and marker.value in (words.success, words.failure):
-            # The outcome may follow after the end.
-            found[-1] = replace(found[-1], success=marker.value == words.success)
-        elif begin is not None and marker.value in words.discard:
-            found.append(Window(begin_ns=begin, end_ns=marker.time_ns, discarded=marker.value))
-            begin = None
-        elif found and marker.value in words.discard:
-            found[-1] = replace(found[-1], discarded=marker.value)
-    return found
+    return info
 
 
 def _feature(name: str, dtype: DTypeLike, lines: Timelines) -> Feature:
@@ -242,33 +152,14 @@ def _numbers(values: Mapping[str, Any], *keys: str) -> list[float]:
     return [float(number) for number in found.reshape(-1)] if isinstance(found, np.ndarray) and found.size <= 64 else []
 
 
-def _problems(episode: PlannedEpisode, video: VideoConfig) -> Iterator[str]:
+def _problems(info: EpisodeInfo, rows: EpisodeRows, video: VideoConfig) -> Iterator[str]:
     """Problems that prevent a recording, found before anything of the bag is written."""
-    yield from find_problems(episode.info)
-    for name, plan in episode.rows.cameras.items():
+    yield from find_problems(info)
+    for name, plan in rows.cameras.items():
         if not plan.kept and (problem := size_problem(video, plan.head.width, plan.head.height)):
             yield f"camera {name}: {problem}"
-    table = episode.rows.table
+    table = rows.table
     for stamps in (table.time_ns, *table.stamps.values(), *table.image_stamps.values()):
         if len(stamps) and not 0 <= stamps.min() <= stamps.max() <= MAX_STAMP_NS:
             yield f"a message has the time {stamps.min() / NS:.0f} s, allowed are 0 to {MAX_STAMP_NS // NS} s"
             return
-
-
-def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason: str) -> EpisodeReport:
-    """Report a window of a bag that begins at `zero_ns`, with its episode or the reason why it has none."""
-    begin_ns, end_ns, num_frames = window.begin_ns, window.end_ns, 0
-    if episode:
-        times = episode.rows.table.time_ns
-        begin_ns, end_ns, num_frames = int(times[0]), int(times[-1]), len(times)
-    return EpisodeReport(
-        episode_index=episode.info.episode_index if episode else None,
-        begin_s=(begin_ns - zero_ns) / NS,
-        end_s=(end_ns - zero_ns) / NS,
-        num_frames=num_frames,
-        success=window.success,
-        pictures={name: plan.described() for name, plan in episode.rows.cameras.items()} if episode else {},
-        reason=reason,
-        discarded=window.discarded,
-        follows=episode.rows.follows if episode else "",
-    )

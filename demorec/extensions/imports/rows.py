@@ -36,22 +36,6 @@ _SAME_COUNT = 2
 """Maximum difference in image counts between cameras of one rate: one at each end of an episode."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Window:
-    """Interval of an episode in its bag.
-
-    Attributes:
-        begin_ns, end_ns: First and last moment, by the mapping's clock.
-        success: Outcome; None if the bag does not record it.
-        discarded: Marker that discards it; "" for others.
-    """
-
-    begin_ns: int
-    end_ns: int
-    success: bool | None = None
-    discarded: str = ""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TakenImages:
     """Images that an episode takes from a camera.
@@ -79,20 +63,14 @@ class EpisodeRows:
     """An episode before its images are read.
 
     Attributes:
-        window: Its interval in the bag.
         table: Its rows, by the mapping's clock; a feature has the age of its oldest source.
         cameras: Name -> its images.
         follows: Stream with one row per message ("camera front"); "" for a grid.
     """
 
-    window: Window
     table: Table
     cameras: Mapping[str, TakenImages]
     follows: str
-
-
-class NoRowsError(BagError):
-    """An episode would have missing or outdated data; `str` is the reason."""
 
 
 class Timelines:
@@ -114,16 +92,16 @@ class Timelines:
             else:
                 yield (feature, index), 0
 
-    def rows(self, window: Window) -> EpisodeRows:
-        """Rows of an episode; NoRowsError if a stream has no usable data for them."""
-        begin, end = self._extent(window)
-        times, follows = self._times(window, begin, end)
+    def rows(self) -> EpisodeRows:
+        """Rows of the bag's episode; BagError if a stream has no usable data for them."""
+        begin, end = self._extent()
+        times, follows = self._times(begin, end)
         if len(times) < 2:
-            raise NoRowsError(f"only {len(times)} rows have all streams")
+            raise BagError(f"only {len(times)} rows have all streams")
         chosen = {key: line.chosen(times) for key, line in self.lines.items()}
         for judge in (_too_old, _unfit):
             if problems := [text for key, rows in chosen.items() if (text := judge(self.lines[key], rows, times))]:
-                raise NoRowsError("; ".join(problems))
+                raise BagError("; ".join(problems))
         mapped = self.mapping.features
         has_next = any(source.next for sources in mapped.values() for source in sources)
         count = len(times) - has_next
@@ -131,7 +109,6 @@ class Timelines:
         shown = {name: chosen[name].index[:count] for name in self.mapping.cameras}
         places = {name: _taken(self.lines[name], indices) for name, indices in shown.items()}
         return EpisodeRows(
-            window=window,
             table=Table(
                 time_ns=times[:count],
                 features={name: values for name, (values, _) in features.items()},
@@ -154,27 +131,32 @@ class Timelines:
             ages.append(chosen[key].age_ns[part] - (times[part] - times[:count]))
         return np.concatenate(values, axis=1), times[:count] - np.max(np.stack(ages), axis=0)
 
-    def _extent(self, window: Window) -> tuple[int, int]:
-        """Interval within a window in which all streams have data."""
+    @property
+    def begin_ns(self) -> int:
+        """Time of the bag's first message."""
+        return min(int(line.times_ns[0]) for line in self.lines.values())
+
+    def _extent(self) -> tuple[int, int]:
+        """Interval in which all streams have data."""
         max_trim_s, lines = self.mapping.clock.max_trim_s, list(self.lines.values())
-        begins, ends = [_first(line, window) for line in lines], [_last(line, window) for line in lines]
+        begins, ends = [int(line.times_ns[0]) for line in lines], [_end(line) for line in lines]
         begin, last = max(begins), max(int(line.times_ns[-1]) for line in lines)
-        end = min(window.end_ns, *ends, last)
+        end = min(last, *ends)
         late, early = lines[begins.index(begin)], lines[ends.index(min(ends))]
         problems = []
-        if begin - window.begin_ns > round(max_trim_s * NS):
-            problems.append(f"{late.label} begins {(begin - window.begin_ns) / NS:.2f} s late")
-        if window.end_ns - end > round(max_trim_s * NS):
-            problems.append(f"{early.label} ends {(window.end_ns - end) / NS:.2f} s early")
+        if begin - self.begin_ns > round(max_trim_s * NS):
+            problems.append(f"{late.label} begins {(begin - self.begin_ns) / NS:.2f} s late")
+        if last - end > round(max_trim_s * NS):
+            problems.append(f"{early.label} ends {(last - end) / NS:.2f} s early")
         if problems:
-            raise NoRowsError(f"{' and '.join(problems)}, allowed are {max_trim_s:g} s")
+            raise BagError(f"{' and '.join(problems)}, allowed are {max_trim_s:g} s")
         return begin, end
 
-    def _times(self, window: Window, begin: int, end: int) -> tuple[Int, str]:
+    def _times(self, begin: int, end: int) -> tuple[Int, str]:
         """(R,) row times, and the stream that they follow."""
         clock = self.mapping.clock
         if clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
-            return self._followed(cameras, window, begin, end), f"camera {cameras[0]}"
+            return self._followed(cameras, begin, end), f"camera {cameras[0]}"
         # A stream faster than the rows has skipped messages for any choice of rows. (The median period of a
         # stream with jitter has an error of a few hundredths.)
         slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
@@ -197,29 +179,20 @@ class Timelines:
         lead = next((name for name in may_lead if counts[name] <= fewest + _SAME_COUNT), "")
         return [lead, *(name for name in counts if name != lead)] if lead else []
 
-    def _followed(self, cameras: list[str], window: Window, begin: int, end: int) -> Int:
+    def _followed(self, cameras: list[str], begin: int, end: int) -> Int:
         """One row for each image of the first camera, placed so that the others' images are also shown."""
         line = self.lines[cameras[0]]
         # An image from shortly before another stream's start is used as soon as that stream has data.
-        first = max(window.begin_ns, begin - line.period_ns // 2)
+        first = begin - line.period_ns // 2
         lead = np.unique(np.maximum(line.within(first, end), begin))
         others = [self.lines[name].times_ns for name in cameras[1:]]
         return followed(lead, others, period_ns=line.period_ns, end_ns=end)
 
 
-def _first(line: Timeline, window: Window) -> int:
-    """Time from which a stream has data in a window: the window's start if the preceding message is still usable."""
-    before = int(np.searchsorted(line.times_ns, window.begin_ns, side="right")) - 1
-    if before >= 0 and window.begin_ns - int(line.times_ns[before]) <= line.max_age_ns:
-        return window.begin_ns
-    return int(line.times_ns[min(before + 1, len(line.times_ns) - 1)])
-
-
-def _last(line: Timeline, window: Window) -> int:
+def _end(line: Timeline) -> int:
     """Time until which a stream has data: its last message is valid until the next would have arrived."""
-    last = max(0, int(np.searchsorted(line.times_ns, window.end_ns, side="right")) - 1)
     age = min(line.max_age_ns, line.period_ns) if line.is_regular else line.max_age_ns
-    return int(line.times_ns[last]) + age
+    return int(line.times_ns[-1]) + age
 
 
 def _too_old(line: Timeline, chosen: ChosenSamples, times: Int) -> str:

@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,6 @@ from demorec.extensions.imports.fields import (
     OtherPublisherError,
     SourceReader,
     converted,
-    follow,
-    parse_path,
     reader_of,
     stamp_of,
 )
@@ -149,14 +147,6 @@ class Stream:
         return converted(self.part, np.frombuffer(self.vectors, self.dtype).reshape(len(self.logged), -1))
 
 
-class Text(NamedTuple):
-    """A text, number or boolean of a topic (marker, robot description), with its time by the mapping's clock."""
-
-    time_ns: int
-    value: Any
-    is_header: bool
-
-
 def _label(feature: str, source: Source, sources: Sequence[Source]) -> str:
     """Name of a feature, with the first joint if several of its sources share a topic."""
     is_shared = source.joints and sum(other.topic == source.topic for other in sources) > 1
@@ -169,12 +159,11 @@ class BagStreams:
     Attributes:
         all: Key -> stream, the sources of features before cameras.
         infos: Camera name -> its first calibration message.
-        texts: Topic -> its texts.
+        urdf: First robot description; None without one.
         problems: Reasons why parts of the bag could not be read.
     """
 
     def __init__(self, mapping: SourceMapping) -> None:
-        self._mapping = mapping
         self.problems: list[str] = []
         self._decoder = BagDecoder()
         self.all: dict[Key, Stream] = {
@@ -188,14 +177,11 @@ class BagStreams:
         self._of_topic: dict[str, list[Stream]] = {}
         for stream in self.all.values():
             self._of_topic.setdefault(stream.topic, []).append(stream)
-        self._fields = {mapping.robot.urdf_topic: "data"}
-        if mapping.episodes.cut == "marker":
-            self._fields[mapping.episodes.topic] = mapping.episodes.field
-        self._fields.pop("", None)
-        self.texts: dict[str, list[Text]] = {topic: [] for topic in self._fields}
+        self._urdf_topic = mapping.robot.urdf_topic
+        self.urdf: Any = None
         self.infos: dict[str, Values] = {}
         self._info_topics = {camera.info_topic: name for name, camera in mapping.cameras.items() if camera.info_topic}
-        self._wanted = {*self._of_topic, *self._fields, *self._info_topics}
+        self._wanted = {*self._of_topic, *self._info_topics, self._urdf_topic} - {""}
         self._counts: dict[str, int] = {}
         self._types: defaultdict[str, set[str]] = defaultdict(set)
         self._refused: dict[str, str] = {}
@@ -217,29 +203,14 @@ class BagStreams:
         except (ValueError, RecursionError, OverflowError, TypeError) as error:
             for stream in streams:
                 stream.malformed(str(error))
-            if topic in self.texts:
-                self._refused[topic] = describe_error(error)
             return
         for stream in streams:
             stream.add(number, message, values)
-        if topic in self.texts:
-            self._add_text(topic, message, values)
+        if topic == self._urdf_topic and self.urdf is None:
+            self.urdf = values.get("data")
         if topic in self._info_topics:
             kept = {key: values[key] for key in _INFO_FIELDS if key in values}
             self.infos.setdefault(self._info_topics[topic], kept)
-
-    def _add_text(self, topic: str, message: ScannedMessage, values: Values) -> None:
-        try:
-            value = follow(values, parse_path(self._fields[topic]))
-        except ValueError as error:
-            self._refused[topic] = str(error)
-            return
-        value = value.item() if isinstance(value, np.generic) else value
-        if not isinstance(value, str | bool | int | float):
-            self._refused[topic] = f"the field {self._fields[topic]!r} is not a text, number or boolean"
-            return
-        stamp = stamp_of(values) if self._mapping.clock.stamp == "header" else None
-        self.texts[topic].append(Text(message.log_ns if stamp is None else stamp, value, stamp is not None))
 
     def check(self, bag: Bag) -> None:
         """Raise BagError with everything that the mapping names and the bag lacks."""

@@ -294,7 +294,6 @@ def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequ
     yield f"fps = {min(max(1, round(rate)), MAX_FPS)}"
     if slowest:
         yield f'rows = "camera"  # a row for each image of the slowest, {quoted(slowest)}; or "grid"'
-    yield 'when_old = "error"  # or "drop_episode"'
 
 
 def _sources(feature: str, parts: Sequence[_Part], topics: Mapping[str, _Topic]) -> Iterator[str]:
