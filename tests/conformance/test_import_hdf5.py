@@ -89,15 +89,15 @@ def nearest(shown: NDArray[np.uint8], candidates: NDArray[np.uint8]) -> int:
     return int(np.abs(candidates.astype(int) - shown).mean(axis=(1, 2, 3)).argmin())
 
 
-def test_a_mask_selects_episodes_and_a_dataset_sets_the_outcome(tmp_path: Path) -> None:
+def test_a_dataset_sets_the_outcome(tmp_path: Path) -> None:
     file = write_robomimic(tmp_path / "demo.hdf5")
-    changes = {'# mask = "train"': 'mask = "train"', '# success = "rewards"': 'success = "rewards"'}
+    changes = {'# success = "rewards"': 'success = "rewards"'}
     with h5py.File(file, "r+") as opened:
         opened["data/demo_10/rewards"][-1] = 0
     result, run = imported(file, changes=changes)
-    assert (result.num_episodes, result.num_frames) == (2, 13)
+    assert (result.num_episodes, result.num_frames) == (3, 18)
     lines = load_any_run_file(run).attempts
-    assert [(line.num_frames, line.success) for line in lines] == [(7, True), (6, False)]
+    assert [(line.num_frames, line.success) for line in lines] == [(7, True), (5, True), (6, False)]
     assert set(result.left_out) == {"dones", "states", "next_obs"}
 
 
@@ -234,11 +234,6 @@ def _replaced(name: str, make: Callable[[h5py.Group, str], object]) -> Callable[
     return replace
 
 
-def _without_masked(file: h5py.File) -> None:
-    del file["mask"]
-    file["mask/train"] = np.array(["demo_7"], dtype="S")
-
-
 FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "no such key": (lambda file: file["data/demo_1/obs"].move("object", "objekt"), "Did you mean 'objekt'"),
     "no episodes": (lambda file: [file.__delitem__(f"data/{name}") for name in DEMOS], "No episodes in data"),
@@ -278,7 +273,6 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
         lambda file: file["data"].attrs.__setitem__("env_args", '{"env_kwargs": {"control_freq": 12.5}}'),
         "12.5 rows a second",
     ),
-    "mask": (_without_masked, "demo_7"),
     "outcome": (
         lambda file: [file[f"data/{name}"].attrs.__setitem__("outcome", "true") for name in DEMOS],
         "has outcome = 'true', allowed are booleans and numbers",
@@ -287,7 +281,6 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
 
 
 CHANGES = {
-    "mask": {'# mask = "train"': 'mask = "train"'},
     "outcome": {'# success = "rewards"': 'success = "outcome"'},
 }
 """Fault -> changes of the suggested mapping."""

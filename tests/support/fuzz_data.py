@@ -82,7 +82,6 @@ text = "lift"
 fps = 20
 [episodes]
 group = "data"
-mask = "train"
 success = "rewards"
 [[features."observation.state"]]
 dataset = "obs/robot0_joint_pos"

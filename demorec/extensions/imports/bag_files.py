@@ -97,13 +97,11 @@ def _rosbags_messages(reader: Any, topics: Topics, report: Report) -> Iterator[S
 def _channel(connection: Any) -> ScannedChannel:
     """Channel of a `rosbags` connection."""
     encoding = getattr(connection.ext, "serialization_format", "ros1")
-    definition = connection.msgdef
+    kind = connection.msgdef.format.name
     return ScannedChannel(
         topic=connection.topic,
         type=connection.msgtype,
         encoding=encoding or "cdr",
-        schema_encoding={"MSG": "ros1msg" if encoding == "ros1" else "ros2msg", "IDL": "ros2idl"}.get(
-            definition.format.name, ""
-        ),
-        schema=definition.data.encode(),
+        schema_encoding="ros1msg" if encoding == "ros1" else {"MSG": "ros2msg", "NONE": ""}.get(kind, kind),
+        schema=connection.msgdef.data.encode(),
     )

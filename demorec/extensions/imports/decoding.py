@@ -16,7 +16,6 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.base import make_typesdict
-from rosbags.typesys.idl import IDLParser
 from rosbags.typesys.msg import MSGParser
 
 from demorec.core.errors import describe_error
@@ -145,8 +144,6 @@ def _protobuf_values(message: Any, descriptor: Any, methods: Any, depth: int = 0
 
 _TIME = (FieldType("sec", "int32", False, None), FieldType("nanosec", "uint32", False, None))
 _BUILT_IN = {"builtin_interfaces/msg/Time": _TIME, "builtin_interfaces/msg/Duration": _TIME}
-_SEPARATOR = "=" * 80 + "\n"
-"""Separates the definitions of several types in one text."""
 
 
 def _ros_decoder(type_name: str, schema_encoding: str, schema: bytes, *, is_cdr: bool) -> Decoder:
@@ -172,12 +169,6 @@ def _types(name: str, schema_encoding: str, schema: bytes) -> Types:
     try:
         if schema_encoding in ("ros2msg", "ros1msg"):
             parsed = make_typesdict(MSGParser(f"MSG: {name}\n{schema.decode()}").specification())
-        elif schema_encoding == "ros2idl":
-            parsed = {}
-            text = schema.decode()
-            parts = [part.partition("\n")[2] for part in text.split(_SEPARATOR)[1:]] if _SEPARATOR in text else []
-            for part in parts or [text]:
-                parsed |= make_typesdict(IDLParser(part).specification())
         elif not schema_encoding:
             parsed = dict(get_typestore(Stores.ROS2_HUMBLE).fielddefs)
         else:

@@ -144,15 +144,6 @@ class ForeignFile(Closing):
             raise Hdf5Error(f"{place} cannot be used, since {reason}: {self.path}")
         return StoredArray(self.path, place, found)
 
-    def names(self, place: str) -> list[str]:
-        """Read a dataset of texts, such as robomimic's masks; Hdf5Error if it is missing, or not a list of texts."""
-        found = self._find(place)
-        with _errors_reported(f"{place} cannot be read", self.path):
-            is_list = isinstance(found, h5py.Dataset) and len(found.shape or ()) == 1 and not found.is_virtual
-            if not is_list or h5py.check_string_dtype(found.dtype) is None or found.external:
-                raise Hdf5Error(f"{place} is not a list of texts: {self.path}")
-            return [str(text) for text in found.asstr(errors="replace")[:]]
-
     def _find(self, place: str) -> h5py.Group | h5py.Dataset:
         if not place or place in self._items:
             return self._items.get(place, self._root)

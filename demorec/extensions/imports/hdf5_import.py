@@ -171,13 +171,10 @@ class _Stored:
 
     def described(self, urdf: str | None, source: SourceFile, episode_index: int) -> EpisodeInfo:
         """Describe it for its recording; checks every number."""
-        file, place, mapping = self._file, self._place, self._mapping
         dtypes = [feature.vectors(self.num_frames).dtype for feature in self.features]
-        if attribute := mapping.robot.urdf_attribute:
-            urdf = str(found_attribute(file, place, attribute) or "")
         try:
             info = imported_info(
-                mapping,
+                self._mapping,
                 episode_index=episode_index,
                 instruction=self._task(),
                 urdf=urdf,
@@ -267,18 +264,13 @@ def episode_places(file: ForeignFile, episodes: Episodes) -> list[str]:
     """Groups of the episodes, demo_2 before demo_10.
 
     Raises:
-        Hdf5Error: None exist, some of the mask are missing, or one is a link.
+        Hdf5Error: None exist, or one is a link.
     """
     group = episodes.group.strip("/")
     if not episodes.group:
         return [""]
     kinds = file.children(group)
     names = [name for name, kind in kinds.items() if kind != "dataset"]
-    if episodes.mask:
-        wanted = set(file.names(f"mask/{episodes.mask}"))
-        if missing := sorted(wanted - set(names)):
-            raise Hdf5Error(f"mask/{episodes.mask} lists {missing[0]!r}, which is not in {group}: {file.path}")
-        names = [name for name in names if name in wanted]
     if not names:
         raise Hdf5Error(f"No episodes in {group or 'the root'}: {file.path}")
     if others := [name for name in names if kinds[name] == "other"]:

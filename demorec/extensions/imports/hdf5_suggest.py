@@ -158,9 +158,7 @@ def suggested_hdf5_mapping(path: Path, tell: Callable[[str], None]) -> list[str]
         lines += [*_listed(contents, len(places)), ""]
         arguments = "env_args.env_kwargs"
         robot = contents.text(f"{arguments}.robot") or contents.text(f"{arguments}.robots.0") or "robot"
-        is_urdf = "<robot" in contents.text("model_file")[:1000]  # robosuite's models are MuJoCo's
-        model = 'urdf_attribute = "model_file"' if is_urdf else '# urdf = "robot.urdf"'
-        lines += ["[robot]", f"name = {quoted(robot)}", model, ""]
+        lines += ["[robot]", f"name = {quoted(robot)}", '# urdf = "robot.urdf"', ""]
         lines += ["[task]", *_task(contents, path), ""]
         lines += ["[clock]", *_clock(contents, layout), ""]
         lines += ["[episodes]", *_episodes(contents, places, layout)]
@@ -208,9 +206,6 @@ def _episodes(contents: _Contents, places: Sequence[str], layout: _Layout) -> It
         yield "# The file is one episode."
         return
     yield f"group = {quoted(layout.group)}"
-    masks = list(contents.file.children("mask")) if contents.file.is_group("mask") else []
-    if masks:
-        yield f"# mask = {quoted(masks[0])}  # only those that one of these lists: {', '.join(map(quoted, masks))}"
     if any(contents.file.attribute(place, "success") is not None for place in places):
         yield 'success = "success"'
     elif "rewards" in contents.arrays:

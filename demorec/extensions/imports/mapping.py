@@ -110,13 +110,11 @@ class Robot:
         name: Any name; datasets to be merged need the same one.
         urdf: File of its URDF, relative to the mapping file.
         urdf_topic: Topic of its URDF in the bag: "/robot_description".
-        urdf_attribute: Attribute of the HDF5 file's episode with its URDF.
     """
 
     name: str
     urdf: str = ""
     urdf_topic: str = _bag("")
-    urdf_attribute: str = _hdf5("")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,12 +159,10 @@ class Episodes:
 
     Attributes:
         group: Group in which each group is an episode, "/" for the root; "" if the file itself is one.
-        mask: Use only the episodes listed in this dataset of `mask`.
         success: Boolean attribute of the episode, or a dataset with a last row above 0 for success; "" if unknown.
     """
 
     group: str = ""
-    mask: str = ""
     success: str = ""
 
 

@@ -96,7 +96,7 @@ def _unknown_keys(value: Any, kind: Any, place: str, of: SourceKind) -> Iterator
 def _problems(mapping: SourceMapping) -> Iterator[str]:
     """Yield the problems of a mapping that neither depend on a bag or file nor make every episode invalid."""
     is_bag = mapping.kind == "bag"
-    what, elsewhere = ("topic", "topic") if is_bag else ("dataset", "attribute")
+    what = "topic" if is_bag else "dataset"
     for name, advice in ((STATE, "with its source"), (ACTION, f'with its {what}, or next = "{STATE}"')):
         if name not in mapping.features:
             key = name if "." not in name else f'"{name}"'
@@ -110,18 +110,16 @@ def _problems(mapping: SourceMapping) -> Iterator[str]:
         if not (camera.topic or camera.dataset):
             yield f"cameras.{name} needs a {what}"
         yield from _age_problems(f"cameras.{name}", camera.max_age_s)
-    task, clock, episodes = mapping.task, mapping.clock, mapping.episodes
+    task, clock = mapping.task, mapping.clock
     if (bool(task.text.strip()) + bool(task.attribute) + task.file_name) != 1:
         yield f"[task] needs one of {'text' if is_bag else 'text, attribute'} and file_name"
-    if mapping.robot.urdf and (mapping.robot.urdf_topic or mapping.robot.urdf_attribute):
-        yield f"robot.urdf and robot.urdf_{elsewhere} are both given, one is enough"
+    if mapping.robot.urdf and mapping.robot.urdf_topic:
+        yield "robot.urdf and robot.urdf_topic are both given, one is enough"
     if not (clock.fps == 0 and not is_bag) and not 1 <= clock.fps <= MAX_FPS:
         yield f"clock.fps is {clock.fps}, allowed are 1 to {MAX_FPS}"
     yield from _age_problems("clock", clock.max_age_s)
     if not 0 <= clock.max_trim_s <= MAX_SECONDS:
         yield f"clock.max_trim_s is {clock.max_trim_s:g}, it must be 0 to {MAX_SECONDS:g}"
-    if episodes.mask and not episodes.group:
-        yield "episodes.mask chooses among the episodes of a group, but episodes.group is empty"
 
 
 def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Iterator[str]:
