@@ -123,7 +123,7 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from demorec.extensions.imports.bag import open_bag
-    from demorec.extensions.imports.decoding import BagDecoder
+    from demorec.extensions.imports.decoding import decode_message
     from demorec.extensions.imports.fields import image_bytes
     from demorec.extensions.imports.image_messages import decode_image
     from demorec.extensions.imports.mapping_file import read_mapping
@@ -143,11 +143,11 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
         names = [element for key, _ in lines.sources(name) for element in lines.lines[key].stream.names]
         features[name] = {"dtype": "float32", "shape": (len(names),), "names": names}
     dataset = LeRobotDataset.create("local/x", fps=FPS, features=features, root=out / "dataset", use_videos=True)
-    decoder, kept = BagDecoder(), {name: list[NDArray[np.uint8]]() for name in rows.cameras}
+    kept = {name: list[NDArray[np.uint8]]() for name in rows.cameras}
     packets: dict[str, list[bytes]] = {name: [] for name in rows.cameras}
     topics = {camera.topic: name for name, camera in known.cameras.items()}
     for message in opened.messages([], topics.keys()):
-        values, name = decoder.values(message), topics[message.channel.topic]
+        values, name = decode_message(message), topics[message.channel.topic]
         if values["format"] == "jpeg":
             kept[name].append(decode_image(values))
         else:
@@ -171,14 +171,13 @@ def decoding_and_coding(bag: Path) -> None:
     """Only decode every image of the bag and encode it once, as the export does."""
     from demorec.core.config import VideoConfig
     from demorec.extensions.imports.bag import open_bag
-    from demorec.extensions.imports.decoding import BagDecoder
+    from demorec.extensions.imports.decoding import decode_message
     from demorec.extensions.imports.image_messages import decode_image
     from demorec.mcap.video import make_encoder
 
-    decoder = BagDecoder()
     encoders = {topic: make_encoder(video=VideoConfig(), width=WIDTH, height=HEIGHT, fps=FPS) for topic in CAMERAS}
     for message in open_bag(bag).messages([], CAMERAS):
-        encoders[message.channel.topic].encode(decode_image(decoder.values(message)))
+        encoders[message.channel.topic].encode(decode_image(decode_message(message)))
     for encoder in encoders.values():
         encoder.finish()
 

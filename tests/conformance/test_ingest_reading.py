@@ -16,15 +16,15 @@ from support import bags
 
 from demorec.extensions.imports.bag import Bag, open_bag
 from demorec.extensions.imports.bag_files import BagError
-from demorec.extensions.imports.decoding import BagDecoder, UnknownEncodingError
+from demorec.extensions.imports.decoding import UnknownEncodingError, decode_message
 from demorec.extensions.imports.fields import stamp_of
 from demorec.mcap.scan import ScannedChannel, ScannedMessage
 
 
 def _read(bag: Bag) -> tuple[list[tuple[str, int, dict[str, Any]]], list[str]]:
     """(topic, log time, values) of all messages, and the problems."""
-    decoder, problems = BagDecoder(), list[str]()
-    found = [(m.channel.topic, m.log_ns, decoder.values(m)) for m in bag.messages(problems)]
+    problems: list[str] = []
+    found = [(m.channel.topic, m.log_ns, decode_message(m)) for m in bag.messages(problems)]
     return found, problems
 
 
@@ -197,7 +197,7 @@ def test_definitions_are_data(name: str) -> None:
         topic="/x", type="a/msg/Top", encoding="cdr", schema_encoding="ros2msg", schema=HOSTILE[name]
     )
     with pytest.raises(UnknownEncodingError):
-        BagDecoder().values(ScannedMessage(channel, 0, b""))
+        decode_message(ScannedMessage(channel, 0, b""))
     assert not Path("/tmp/ran").exists()
 
 
@@ -207,4 +207,4 @@ def test_no_message_fills_the_memory() -> None:
     many = (2**32 - 1).to_bytes(4, "little")
     for data in (many, bytes(4) + many, bytes(8) + many, b""):
         with pytest.raises(ValueError, match="end"):
-            BagDecoder().values(ScannedMessage(channel, 0, b"\x00\x01\x00\x00" + data))
+            decode_message(ScannedMessage(channel, 0, b"\x00\x01\x00\x00" + data))

@@ -10,7 +10,7 @@ from demorec.episode.episode import Outcome
 from demorec.episode.info import DEPTH_UNITS
 from demorec.extensions.imports.bag import Bag
 from demorec.extensions.imports.bag_files import BagError
-from demorec.extensions.imports.decoding import BagDecoder
+from demorec.extensions.imports.decoding import decode_message
 from demorec.extensions.imports.episode_writer import Image, write_episode
 from demorec.extensions.imports.fields import image_bytes
 from demorec.extensions.imports.image_messages import decode_image
@@ -55,7 +55,7 @@ def _images(bag: Bag, rows: EpisodeRows) -> Iterator[tuple[str, Image]]:
     order = sorted((time, name, place) for name, stamps in times.items() for place, time in enumerate(stamps))
     messages = bag.messages([], {topic for topic, _ in wanted})
     counts: Counter[str] = Counter()
-    decoder, held = BagDecoder(), dict[tuple[str, int], Values]()
+    held: dict[tuple[str, int], Values] = {}
     for _, name, place in order:
         camera = rows.cameras[name]
         try:
@@ -65,7 +65,7 @@ def _images(bag: Bag, rows: EpisodeRows) -> Iterator[tuple[str, Image]]:
                     raise BagError(f"The bag has changed while it was read: images of {camera.topic} are missing.")
                 topic = message.channel.topic
                 if places := wanted.pop((topic, counts[topic]), ()):
-                    held |= dict.fromkeys(places, decoder.values(message))
+                    held |= dict.fromkeys(places, decode_message(message))
                 counts[topic] += 1
             values = held.pop((name, place))
             is_coded = camera.kept and camera.kept not in DEPTH_UNITS

@@ -8,7 +8,7 @@ readers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from graphlib import TopologicalSorter
 from typing import Any
 
@@ -32,29 +32,19 @@ class UnknownEncodingError(ValueError):
     """Messages with an unsupported encoding or definition; `str` is the reason."""
 
 
-class BagDecoder:
-    """Decoders of a bag's channels, created on first use."""
+def decode_message(message: ScannedMessage) -> Values:
+    """Decode a message.
 
-    def __init__(self) -> None:
-        self._decoders: dict[ScannedChannel, Decoder] = {}
+    Raises:
+        UnknownEncodingError: Its channel cannot be decoded.
+        ValueError: The message does not fit its type.
+    """
+    return _decoder_of(message.channel)(message.data)
 
-    def values(self, message: ScannedMessage) -> Values:
-        """Decode a message.
 
-        Raises:
-            UnknownEncodingError: Its channel cannot be decoded.
-            ValueError: The message does not fit its type.
-        """
-        decoder = self._decoders.get(message.channel)
-        if decoder is None:
-            try:
-                decoder = self._decoder_of(message.channel)
-            except ValueError as error:
-                decoder = partial(_refuse, str(error))
-            self._decoders[message.channel] = decoder
-        return decoder(message.data)
-
-    def _decoder_of(self, channel: ScannedChannel) -> Decoder:
+@lru_cache(maxsize=512)
+def _decoder_of(channel: ScannedChannel) -> Decoder:
+    try:
         match channel.encoding:
             case "cdr" | "ros1":
                 is_cdr = channel.encoding == "cdr"
@@ -65,10 +55,8 @@ class BagDecoder:
                 return _decode_json
             case other:
                 raise ValueError(f"the encoding {other[:40]!r} is not supported; cdr, ros1, protobuf and json are")
-
-
-def _refuse(reason: str, data: bytes) -> Values:
-    raise UnknownEncodingError(reason)
+    except ValueError as error:
+        raise UnknownEncodingError(str(error)) from error
 
 
 def _decode_json(data: bytes) -> Values:
@@ -163,9 +151,8 @@ def _ros_decoder(type_name: str, schema_encoding: str, schema: bytes, *, is_cdr:
     return decode
 
 
-@lru_cache(maxsize=512)
 def _types(name: str, schema_encoding: str, schema: bytes) -> Types:
-    """Fields of a type and of all types that it refers to; cached, because a bag is read twice."""
+    """Fields of a type and of all types that it refers to."""
     try:
         if schema_encoding in ("ros2msg", "ros1msg"):
             parsed = make_typesdict(MSGParser(f"MSG: {name}\n{schema.decode()}").specification())

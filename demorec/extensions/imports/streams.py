@@ -21,7 +21,7 @@ from demorec.core.plain import listed
 from demorec.core.registry import nearest_match
 from demorec.extensions.imports.bag import Bag
 from demorec.extensions.imports.bag_files import BagError
-from demorec.extensions.imports.decoding import BagDecoder, UnknownEncodingError
+from demorec.extensions.imports.decoding import UnknownEncodingError, decode_message
 from demorec.extensions.imports.fields import (
     OtherPublisherError,
     SourceReader,
@@ -165,7 +165,6 @@ class BagStreams:
 
     def __init__(self, mapping: SourceMapping) -> None:
         self.problems: list[str] = []
-        self._decoder = BagDecoder()
         self.all: dict[Key, Stream] = {
             (name, index): Stream(label=_label(name, source, sources), part=source)
             for name, sources in mapping.features.items()
@@ -196,7 +195,7 @@ class BagStreams:
             return
         streams = self._of_topic.get(topic, ())
         try:
-            values = self._decoder.values(message)
+            values = decode_message(message)
         except UnknownEncodingError as error:
             self._refused[topic] = str(error)
             return

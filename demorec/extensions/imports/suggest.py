@@ -19,7 +19,7 @@ import numpy as np
 from demorec.episode.info import DEPTH_UNITS
 from demorec.extensions.imports.bag import NS, Bag, TopicSummary, bags_in, open_bag
 from demorec.extensions.imports.bag_files import BagError
-from demorec.extensions.imports.decoding import BagDecoder, UnknownEncodingError
+from demorec.extensions.imports.decoding import UnknownEncodingError, decode_message
 from demorec.extensions.imports.fields import FieldError, follow, parse_path, reader_of, stamp_of
 from demorec.extensions.imports.image_messages import ImageHead, NoColorError, image_head
 from demorec.extensions.imports.mapping import MAX_FPS, Clock, Source
@@ -159,10 +159,10 @@ class _Topic(TopicSummary):
         usual = steps[np.abs(steps - np.median(steps)) <= 0.5 * np.median(steps)]  # without pauses
         return NS / float(usual.mean()) if len(usual) else self.rate_hz
 
-    def look_into(self, message: ScannedMessage, decoder: BagDecoder) -> None:
+    def look_into(self, message: ScannedMessage) -> None:
         """Examine one of the first messages."""
         try:
-            values = decoder.values(message)
+            values = decode_message(message)
         except UnknownEncodingError as error:
             self.problem = str(error)
             return
@@ -239,13 +239,12 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
 def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
     """Read the topics of a bag."""
     topics: dict[str, _Topic] = {}
-    decoder = BagDecoder()
     for message in bag.messages(problems):
         name = message.channel.topic
         topic = topics.setdefault(name, _Topic(name=name, type=message.channel.type))
         topic.add(message.log_ns)
         if topic.count <= _MAX_DECODED and not topic.problem:
-            topic.look_into(message, decoder)
+            topic.look_into(message)
     return topics
 
 
