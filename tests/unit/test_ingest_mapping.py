@@ -14,7 +14,6 @@ from demorec.extensions.imports.bag_files import BagError
 from demorec.extensions.imports.fields import (
     FieldError,
     OtherPublisherError,
-    converted,
     follow,
     parse_path,
     reader_of,
@@ -32,7 +31,7 @@ WRONG = [
     ('[features.action]', '[features.act]', r"missing feature 'action'"),
     ('[cameras.front]', '[cameras."a b"]', r"a camera is called 'a b', allowed are letters"),
     ('topic = "/leader/joint_states"', 'next = "observation.stat"', r"Did you mean 'observation.state'\?"),
-    ('field = "position"\n[cam', 'field = "position"\nunit = "rad"\nto = "m"\n[cam', r"cannot turn rad into m"),
+    ('field = "position"\n[cam', 'field = "position"\nunit = "feet"\n[cam', r"'feet' is not one of"),
     ("/follower/joint_states", "/folower/joint_states", r"no message of '/folower/joint_states'. Did you mean '/foll"),
     ('field = "position"', 'field = "postion"', r"no field 'postion'. Did you mean 'position'\?"),
     ('field = "position"', 'field = "position"\njoints = ["shoulder_pam"]', r"Did you mean 'shoulder_pan'\?"),
@@ -100,15 +99,3 @@ def test_messages_of_another_publisher_are_a_finding_without_a_list_of_joints(tm
     (text,) = [finding.text for finding in report.findings if finding.kind == "malformed"]
     assert "15 messages cannot be used" in text
     assert "'wheel_left': select one publisher by joints" in text
-
-
-@pytest.mark.parametrize(
-    ("unit", "to", "given", "expected"),
-    [
-        ("degree", "rad", [180.0, -90.0], [np.pi, -np.pi / 2]),
-        ("mm", "m", [5.0, 0.0], [0.005, 0.0]),
-    ],
-)
-def test_units(unit: str, to: str, given: list[float], expected: list[float]) -> None:
-    source = Source(topic="/j", field="x", unit=unit, to=to)  # type: ignore[arg-type]
-    assert np.allclose(converted(source, np.array([given])), expected)

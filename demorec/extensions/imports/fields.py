@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from demorec.core.registry import nearest_match
 from demorec.extensions.imports.bag_files import MAX_TIME_NS
-from demorec.extensions.imports.mapping import CONVERSIONS, MAX_ELEMENTS, Source
+from demorec.extensions.imports.mapping import MAX_ELEMENTS, Source
 from demorec.mcap.cdr import Values
 
 _STEP = re.compile(r"(?P<name>[^.\[\]]+)|\[(?P<key>[^=\]]+)=(?P<value>[^\]]*)\]|\[(?P<index>\d+)\]")
@@ -170,7 +170,7 @@ class SourceReader:
     _orders: dict[tuple[str, ...], list[int]] = field(init=False, compare=False, default_factory=dict)
 
     def read(self, values: Values) -> NDArray[np.floating[Any]]:
-        """(D,) float32 or float64, in the bag's unit.
+        """(D,) float32 or float64.
 
         Raises:
             FieldError: The message lacks content of the first one.
@@ -294,9 +294,3 @@ def _joined(parts: Sequence[Any]) -> NDArray[np.floating[Any]]:
     arrays = [np.atleast_1d(np.asarray(part)) for part in parts]
     single = all(array.dtype.newbyteorder("=") == np.float32 for array in arrays)
     return np.concatenate([array.astype(np.float32 if single else np.float64) for array in arrays])
-
-
-def converted(part: Source, vectors: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Return (N, D) in the feature's unit; the same array if the units are equal."""
-    factor = CONVERSIONS.get((part.unit, part.to or part.unit))
-    return vectors if factor is None else vectors.astype(np.float64) * factor

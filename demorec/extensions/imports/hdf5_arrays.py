@@ -13,7 +13,7 @@ from demorec.core.config import MAX_PIXELS
 from demorec.episode.info import Camera, Feature, Kept
 from demorec.extensions.imports.description import imported_feature
 from demorec.extensions.imports.episode_writer import Image
-from demorec.extensions.imports.fields import FieldError, converted, names_of, picked
+from demorec.extensions.imports.fields import FieldError, names_of, picked
 from demorec.extensions.imports.hdf5_file import Hdf5Error, StoredArray
 from demorec.extensions.imports.image_messages import decode_image, image_head
 from demorec.extensions.imports.mapping import MAX_ELEMENTS, CameraSource, Source
@@ -38,7 +38,7 @@ class StoredFeature:
     def described(self, dtype: DTypeLike) -> Feature:
         """Describe it in recordings' form, with vectors of this type."""
         names = tuple(name for part_names in self._names for name in part_names)
-        units = [part.to or part.unit for part, own in zip(self._parts, self._names, strict=True) for _ in own]
+        units = [part.unit for part, own in zip(self._parts, self._names, strict=True) for _ in own]
         called = (name.removesuffix(".pos") for name in names)  # LeRobot's suffix for the position of a joint
         source = "; ".join(part.dataset for part in self._parts) + (" of the next row" if self.shift else "")
         return imported_feature(self.name, dtype, names, units, called=called, source=source)
@@ -62,7 +62,7 @@ def _rows(part: Source, array: StoredArray, names: Sequence[str], begin: int, en
     if rows.dtype.kind in "iu" and ((rows > _EXACT) | (rows < -_EXACT)).any():
         raise FieldError(f"{array.place} has whole numbers that float64 cannot hold")
     is_small = rows.dtype.kind == "f" and rows.dtype.itemsize <= 4
-    values = converted(part, rows.astype(np.float32 if is_small else np.float64))
+    values: NDArray[np.floating[Any]] = rows.astype(np.float32 if is_small else np.float64)
     if len(wrong := np.argwhere(~np.isfinite(values))):
         row, element = wrong[0].tolist()
         number, place = values[row, element], f"row {begin + row} ({names[element]})"

@@ -11,7 +11,6 @@ Most keys apply to both; those of one kind are marked, and rejected in a mapping
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -56,8 +55,7 @@ class Source:
         elements: Elements by number, in this order (auto: all).
         names: Names of the elements in the feature (auto: the source's names).
         prefix: Prefix of each name, for two arms with the same names.
-        unit: Unit of the source.
-        to: Unit of the feature (auto: the source's, which keeps values bit-exact).
+        unit: Unit of the numbers, which stay bit-exact.
         next: Instead of a source: a feature to take from the next row.
     """
 
@@ -65,7 +63,6 @@ class Source:
     names: tuple[str, ...] = ()
     prefix: str = ""
     unit: Unit = ""
-    to: Unit = ""
     next: str = ""
     topic: str = _bag("")
     field: str = _bag("")
@@ -196,12 +193,3 @@ class SourceMapping:
         parts = {part.dataset for parts in self.features.values() for part in parts}
         named = parts | {camera.dataset for camera in self.cameras.values()} | {self.episodes.success}
         return frozenset(name.strip("/") for name in named)
-
-
-CONVERSIONS: Mapping[tuple[str, str], float] = {
-    ("degree", "rad"): math.pi / 180,
-    ("rad", "degree"): 180 / math.pi,
-    ("mm", "m"): 1e-3,
-    ("m", "mm"): 1e3,
-}
-"""(unit of the source, unit of the feature) -> factor."""

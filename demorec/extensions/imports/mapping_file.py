@@ -17,7 +17,6 @@ from demorec.core.plain import MAX_LISTED, from_plain, listed
 from demorec.core.registry import nearest_match
 from demorec.episode.features import ACTION, STATE
 from demorec.extensions.imports.mapping import (
-    CONVERSIONS,
     KIND,
     MAX_FPS,
     MAX_SECONDS,
@@ -129,9 +128,6 @@ def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Itera
             yield f"{place} names {what} twice"
     if any(element < 0 for element in source.elements):
         yield f"{place} names an element below 0"
-    pair = (source.unit, source.to or source.unit)
-    if pair not in CONVERSIONS and pair[0] != pair[1]:
-        yield f"{place} cannot turn {source.unit or 'no unit'} into {source.to}"
     if source.next:
         known = [other for other in mapping.features if other != name]
         if len(mapping.features[name]) > 1 and not is_bag:

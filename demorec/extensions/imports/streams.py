@@ -25,7 +25,6 @@ from demorec.extensions.imports.decoding import UnknownEncodingError, decode_mes
 from demorec.extensions.imports.fields import (
     OtherPublisherError,
     SourceReader,
-    converted,
     reader_of,
     stamp_of,
 )
@@ -51,7 +50,7 @@ class Stream:
         reader: Reader of a source's numbers, set by its first message.
         logged, stamped: Growing `log_ns` and `header_ns`.
         places: Index of each message within its topic, from 0; empty except for cameras.
-        vectors: Concatenated vectors of the source, in its unit: a separate array per message would take three times as
+        vectors: Concatenated vectors of the source: a separate array per message would take three times as
         much memory for a million messages, and fragment it.
         heads: (N,) head of each image; empty except for cameras.
         num_malformed, first_problem: Messages that cannot be read or are incomplete, and the first one's problem.
@@ -132,8 +131,8 @@ class Stream:
 
     @property
     def unit(self) -> Unit:
-        """Unit of the feature; "" for cameras."""
-        return (self.part.to or self.part.unit) if isinstance(self.part, Source) else ""
+        """Unit of the numbers; "" for cameras."""
+        return self.part.unit if isinstance(self.part, Source) else ""
 
     @property
     def are_keyframes(self) -> NDArray[np.bool_]:
@@ -142,9 +141,8 @@ class Stream:
 
     @cached_property
     def values(self) -> NDArray[np.floating[Any]]:
-        """(N, D) numbers of a source in the feature's unit."""
-        assert isinstance(self.part, Source)
-        return converted(self.part, np.frombuffer(self.vectors, self.dtype).reshape(len(self.logged), -1))
+        """(N, D) numbers of a source."""
+        return np.frombuffer(self.vectors, self.dtype).reshape(len(self.logged), -1)
 
 
 def _label(feature: str, source: Source, sources: Sequence[Source]) -> str:
