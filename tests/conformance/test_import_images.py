@@ -78,12 +78,7 @@ CLEAN: dict[str, Mapping[str, Sequence[int]]] = {
 
 @pytest.mark.parametrize(
     ("name", "rows"),
-    [
-        (name, rows)
-        for name in CLEAN
-        for rows in ("default", "suggested", "grid")
-        if rows == "default" or SIDE in CLEAN[name]
-    ],
+    [(name, rows) for name in CLEAN for rows in ("default", "suggested") if rows == "default" or SIDE in CLEAN[name]],
 )
 def test_no_image_is_lost(name: str, rows: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cameras = CLEAN[name]
@@ -92,8 +87,6 @@ def test_no_image_is_lost(name: str, rows: str, tmp_path: Path, capsys: pytest.C
     if rows == "suggested":
         mapping = suggested(path, capsys)
         assert tomllib.loads(mapping)["clock"]["fps"] == 30
-    elif rows == "grid":
-        mapping = mapping.replace("fps = 30", 'fps = 30\nrows = "grid"')
     told, shown = imported(path, mapping, tmp_path, capsys)
     assert "No findings." in told
     # Nothing can be shown before the second camera's first image, nor after the first camera's last one.

@@ -173,7 +173,7 @@ class Fuzzed:
         return self._imported(bag, bag_mappings.SO101, chance)
 
     def _mapping(self, chance: random.Random) -> Words:
-        keys = chance.choice(("", "max_trim_s = 1\n", 'rows = "grid"\n', 'stamp = "log"\n'))
+        keys = chance.choice(("", "max_trim_s = 1\n", 'stamp = "log"\n'))
         text = MAPPING.replace("fps = 30\n", f"fps = 30\n{keys}")
         return self._imported(
             self._json_bag(lambda topic, values: None), _changed_lines(text, "= ", _TOML, chance), chance

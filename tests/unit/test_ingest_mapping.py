@@ -24,7 +24,7 @@ from demorec.extensions.imports.mapping import Source
 WRONG = [
     ('fps = 30', 'fpss = 30', r"unknown key 'fpss' in clock. Did you mean 'fps'\?"),
     ('fps = 30', 'fps = "x"', r"'x' is not a whole number"),
-    ('fps = 30', 'fps = 30\nrows = "service"', r"'service' is not one of 'camera', 'grid'"),
+    ('fps = 30', 'fps = 30\nstamp = "sensor"', r"'sensor' is not one of 'header', 'log'"),
     ('[robot]', '[episodes]\ngroup = "data"\n[robot]', r"unknown key 'episodes'"),
     ('fps = 30', 'fps = 30\nmax_age_s = 0', r"clock.max_age_s is 0, it must be above 0"),
     ('text = "stack the cups"', '', r"\[task\] needs one of text and file_name"),

@@ -217,7 +217,7 @@ def _use_findings(line: Timeline, rows_ns: Int, fps: int, follows: str) -> Itera
     advice = f"use fps = {max(1, round(rate))}"
     if num_free and num_skipped:
         is_other_rate = abs(rate - fps) > max(RATE * fps, 0.5)
-        uneven = "they come too unevenly for these rows" if follows else 'use rows = "camera"'
+        uneven = "they come too unevenly for these rows"
         yield _of(line, "repeats", f"{repeats} and {skips}: {advice if is_other_rate else uneven}")
     elif follows:
         return  # the images of a camera that has another rate than the one that rows follow

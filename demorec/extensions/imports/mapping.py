@@ -135,16 +135,14 @@ class Clock:
     """Times of the rows, and the messages that they take.
 
     Attributes:
-        fps: Rows per second, also of the dataset. Required for bags; 0 uses the HDF5 file's own rate.
-        rows: "camera": a row for each image of the slowest camera among those with `fps` images per second (without
-        any, a grid); "grid": evenly spaced.
+        fps: Rows per second, also of the dataset. A bag has a row for each image of the slowest camera among those with
+        `fps` images per second; without any, evenly spaced rows. Required for bags; 0 uses the HDF5 file's own rate.
         stamp: Whether a message's time is its header time or its log time.
         max_age_s: Maximum age of a message at its row, which takes the last one before it.
         max_trim_s: Maximum time to leave out at the bag's beginning and end if a stream starts late or ends early.
     """
 
     fps: int = 0
-    rows: Literal["camera", "grid"] = _bag("camera")
     stamp: Literal["header", "log"] = _bag("header")
     max_age_s: float = _bag(0.2)
     max_trim_s: float = _bag(1.0)

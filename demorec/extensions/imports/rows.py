@@ -154,13 +154,13 @@ class Timelines:
 
     def _times(self, begin: int, end: int) -> tuple[Int, str]:
         """(R,) row times, and the stream that they follow."""
-        clock = self.mapping.clock
-        if clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
+        fps = self.mapping.clock.fps
+        if cameras := self._cameras_at_fps(begin, end):
             return self._followed(cameras, begin, end), f"camera {cameras[0]}"
         # A stream faster than the rows has skipped messages for any choice of rows. (The median period of a
         # stream with jitter has an error of a few hundredths.)
-        slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
-        return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
+        slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * fps > 0.9 * NS]
+        return grid(begin, end, fps, [line.times_ns for line in slow]), ""
 
     def _cameras_at_fps(self, begin: int, end: int) -> list[str]:
         """Cameras with an image for each row. The first, which rows follow, has the fewest images, but not depth; among

@@ -292,7 +292,7 @@ def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequ
     rate = rates[slowest] if slowest else min(rates.values(), default=_USUAL_FPS)
     yield f"fps = {min(max(1, round(rate)), MAX_FPS)}"
     if slowest:
-        yield f'rows = "camera"  # a row for each image of the slowest, {quoted(slowest)}; or "grid"'
+        yield f"# There is a row for each image of the slowest camera, {quoted(slowest)}."
 
 
 def _sources(feature: str, parts: Sequence[_Part], topics: Mapping[str, _Topic]) -> Iterator[str]:
