@@ -59,8 +59,7 @@ def test_a_suggested_mapping_works_unedited(name: str, tmp_path: Path, capsys: p
                 assert np.array_equal(table.features["action"][row - 1], state[row])
         assert len(recording.info.cameras) == layout.cameras
         for camera in recording.info.cameras:
-            topic = camera.source.partition(",")[0]
-            stamps = {note.header_ns for note in notes if note.topic == topic and note.header_ns <= times[-1]}
+            stamps = {note.header_ns for note in notes if note.topic == camera.source and note.header_ns <= times[-1]}
             assert set(table.image_stamps[camera.name].tolist()) == stamps
 
 

@@ -91,6 +91,8 @@ _NO_ENVIRONMENT = f"{ENVIRONMENT_PREFIX}collected"
 """Environment name for episodes without one."""
 _GYM = 2
 """`EnvType.GYM_TYPE` of robomimic."""
+_GZIP_LEVEL = 4
+"""Level of gzip for images, of 1 to 9 (smallest)."""
 _ROBOSUITE = {
     STATE: {"robot0_joint_pos": slice(None, -1), "robot0_gripper_qpos": slice(-1, None)},
     VELOCITY: {"robot0_joint_vel": slice(None, -1), "robot0_gripper_qvel": slice(-1, None)},
@@ -131,7 +133,7 @@ def _fill(demo: h5py.Group, episode: Hdf5Episode) -> None:
     for name, camera in zip(images, episode.cameras, strict=True):
         settings = episode.recording.video_settings(camera.name)
         shape = (count, settings.height, settings.width, 1 if camera.is_depth else 3)
-        _add_images(group, name, shape, episode.images(camera), episode.options.compression)
+        _add_images(group, name, shape, episode.images(camera))
 
 
 def _add_masks(root: h5py.Group, num_episodes: int, valid_share: float) -> None:
@@ -219,13 +221,11 @@ def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], comp
     stored.attrs["names"] = json.dumps(components)
 
 
-def _add_images(
-    group: h5py.Group, name: str, shape: tuple[int, ...], images: Iterable[NDArray[np.generic]], compression: int
-) -> None:
+def _add_images(group: h5py.Group, name: str, shape: tuple[int, ...], images: Iterable[NDArray[np.generic]]) -> None:
     """Write (T, H, W, 3) uint8 colour or (T, H, W, 1) float32 depth images; each image is one chunk."""
-    kind, zipped = np.uint8 if shape[-1] == 3 else np.float32, {}
-    if compression:
-        zipped = {"compression": "gzip", "compression_opts": compression}
-    stored = group.create_dataset(name, shape, kind, chunks=(1, *shape[1:]), **zipped)
+    kind = np.uint8 if shape[-1] == 3 else np.float32
+    stored = group.create_dataset(
+        name, shape, kind, chunks=(1, *shape[1:]), compression="gzip", compression_opts=_GZIP_LEVEL
+    )
     for index, image in enumerate(images):
         stored[index] = image.reshape(shape[1:])

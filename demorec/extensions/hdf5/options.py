@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from demorec.core.errors import OptionError, check_option
+from demorec.core.errors import OptionError
 from demorec.datasets.options import CommonOptions, Exporter
 
 
@@ -14,15 +14,12 @@ class Hdf5Options(CommonOptions):
 
     valid_share: float = 0.1
     """Share of the episodes that mask/valid names, spread evenly; mask/train names the others."""
-    compression: int = 4
-    """Level of gzip for images, 0 (none) to 9 (smallest)."""
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values."""
         super().validate()
         if not 0 <= self.valid_share < 1:
             raise OptionError("valid_share", f"is {self.valid_share}, allowed are 0 to below 1.")
-        check_option("compression", self.compression, 0, 9)
 
 
 HDF5 = Exporter(

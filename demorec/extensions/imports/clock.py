@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.extensions.imports.bag import NS
-from demorec.extensions.imports.mapping import Clock
+from demorec.extensions.imports.mapping import Clock, Source
 from demorec.extensions.imports.streams import Stream
 
 MISSING = 2**62
@@ -59,11 +59,6 @@ class Timeline:
         return f"{self.stream.label} ({self.stream.topic})"
 
     @property
-    def rule(self) -> str:
-        """Sampling rule in words."""
-        return f"latest by {'header' if self.is_header else 'log'} time"
-
-    @property
     def skews_ns(self) -> Int:
         """(K,) log time minus header time, for messages with a header time."""
         return (self.stream.log_ns - self.stream.header_ns)[self.stream.header_ns > 0]
@@ -81,7 +76,8 @@ class Timeline:
 
 def timeline(stream: Stream, clock: Clock) -> Timeline:
     """Build the timeline of a stream, by header times if requested and if most messages have one."""
-    age_s = clock.max_age_s if stream.part.max_age_s is None else stream.part.max_age_s
+    own_age_s = stream.part.max_age_s if isinstance(stream.part, Source) else None
+    age_s = clock.max_age_s if own_age_s is None else own_age_s
     stamped = stream.header_ns > 0
     is_header = clock.stamp == "header" and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
     times = stream.header_ns if is_header else stream.log_ns

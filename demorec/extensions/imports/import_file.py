@@ -71,11 +71,9 @@ class BagReport:
 def stream_figures(line: Timeline, rows_ns: Int) -> dict[str, str]:
     """Return the figures of a stream by their column in the report's table.
 
-    The skew is the median of log time minus header time, the jitter the deviation of the steps without lost messages,
-    the age that of the oldest message in any row, and unused messages are in no row.
+    The skew is the median of log time minus header time, the age that of the oldest message in any row, and unused
+    messages are in no row.
     """
-    steps = np.diff(line.times_ns)
-    usual = steps[(steps > 0.4 * line.period_ns) & (steps < 1.6 * line.period_ns)]
     chosen = line.chosen(rows_ns)
     return {
         "stream": line.stream.label,
@@ -84,8 +82,6 @@ def stream_figures(line: Timeline, rows_ns: Int) -> dict[str, str]:
         "rate Hz": f"{NS / line.period_ns:.1f}" if line.is_regular else "on change",
         "clock": "header" if line.is_header else "log",
         "skew ms": f"{np.median(line.skews_ns) / 1e6:.1f}" if len(line.skews_ns) else "-",
-        "jitter ms": f"{np.std(usual) / 1e6:.1f}" if line.is_regular else "-",
-        "longest ms": f"{steps.max(initial=0) / 1e6:.1f}",
         "lost": str(int(lost_in(line).sum()) if line.is_regular else 0),
         "age ms": f"{chosen.age_ns.max() / 1e6:.1f}",
         "unused": str(int(np.ptp(chosen.index)) + 1 - len(np.unique(chosen.index))),

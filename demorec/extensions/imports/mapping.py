@@ -84,7 +84,6 @@ class CameraSource:
         topic: Topic of a bag: sensor_msgs Image or CompressedImage, foxglove RawImage, CompressedImage or
         CompressedVideo.
         info_topic: Topic of its calibration (CameraInfo, CameraCalibration).
-        max_age_s: As `Clock.max_age_s`, for this camera.
         dataset: Dataset of an HDF5 file below the episode's group: (T, H, W, 3) or (T, 3, H, W) uint8; or a JPEG file
         in each row, (T, N) uint8 padded with zeros or (T,) of variable length; for a depth camera (T, H, W) or
         (T, H, W, 1), uint16 mm or float32 m.
@@ -94,7 +93,6 @@ class CameraSource:
 
     topic: str = _bag("")
     info_topic: str = _bag("")
-    max_age_s: float | None = _bag(None)
     dataset: str = _hdf5("")
     colors: Literal["rgb", "bgr"] = _hdf5("rgb")
 

@@ -108,7 +108,6 @@ def _problems(mapping: SourceMapping) -> Iterator[str]:
     for name, camera in mapping.cameras.items():
         if not (camera.topic or camera.dataset):
             yield f"cameras.{name} needs a {what}"
-        yield from _age_problems(f"cameras.{name}", camera.max_age_s)
     task, clock = mapping.task, mapping.clock
     if (bool(task.text.strip()) + bool(task.attribute) + task.file_name) != 1:
         yield f"[task] needs one of {'text' if is_bag else 'text, attribute'} and file_name"

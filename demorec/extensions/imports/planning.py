@@ -117,16 +117,12 @@ def _info(bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, settings:
 
 
 def _feature(name: str, dtype: DTypeLike, lines: Timelines) -> Feature:
-    rules = [
-        f"{source.next} of the next frame"
-        if source.next
-        else f"{source.topic} {source.field}, {lines.lines[name, index].rule}"
-        for index, source in enumerate(lines.mapping.features[name])
-    ]
+    sources = lines.mapping.features[name]
+    places = [f"{source.next} of the next frame" if source.next else source.place for source in sources]
     streams = [lines.lines[key].stream for key, _ in lines.sources(name)]
     names = tuple(element for stream in streams for element in stream.names)
     units = (stream.unit for stream in streams for _ in stream.names)
-    return imported_feature(name, dtype, names, units, called=names, source="; ".join(rules))
+    return imported_feature(name, dtype, names, units, called=names, source="; ".join(places))
 
 
 def _camera(name: str, plan: TakenImages, lines: Timelines) -> Camera:
@@ -142,7 +138,7 @@ def _camera(name: str, plan: TakenImages, lines: Timelines) -> Camera:
         kept=plan.kept,
         intrinsics=tuple(matrix) if known else None,
         distortion=tuple(distortion) if known and len(distortion) == 5 and np.isfinite(distortion).all() else (),
-        source=f"{plan.topic}, {lines.lines[name].rule}",
+        source=plan.topic,
     )
 
 
