@@ -126,7 +126,7 @@ def test_bad_bags_are_skipped_and_listed(
         assert left_out[number]["bag"] == f"run_{2 * number + 1}.mcap"
         assert reason in left_out[number]["reason"]
         assert left_out[number]["reason"] in shown
-    judged = result_of(run, "import_dropped", "run")
+    judged = result_of(run, "import_findings", "run")
     assert judged.findings[0].value == str(len(BAD))
     assert "run_1.mcap: The bag is empty" in judged.findings[0].message
 

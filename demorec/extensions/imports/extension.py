@@ -39,8 +39,5 @@ EXTENSION = Extension(
             describer="demorec.extensions.imports.describe:describe_hdf5",
         ),
     },
-    file_checks={
-        "import_findings": "demorec.extensions.imports.import_file:import_findings",
-        "import_dropped": "demorec.extensions.imports.import_file:import_dropped",
-    },
+    file_checks={"import_findings": "demorec.extensions.imports.import_file:import_findings"},
 )

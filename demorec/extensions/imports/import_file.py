@@ -1,4 +1,4 @@
-"""import.json: sources, mapping and findings of an import, and the checks that report them.
+"""import.json: sources, mapping and findings of an import, and the check that reports them.
 
 The bags may be gone when the run is checked.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -150,34 +149,23 @@ def save_import_file(content: ImportFile, folder: Path) -> None:
 
 _MAX_LISTED = 5
 
-import_check = partial(
-    check,
+
+@check(
     family="files",
     on=("external run",),
+    measures="findings of an import about clocks and losses, and files that it left out",
     needs="an imported run",
     why="Data is missing from the run, or has the wrong time.",
     do="look at it: demorec view {path}",
 )
-
-
-@import_check(measures="findings of the import about clocks and losses")
 def import_findings(run: CheckedRun) -> Iterator[Fault]:
-    """List the findings of the import."""
-    words = [
-        f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
-        for bag in _import_file(run).bags
-        for finding in bag.odd
-    ]
-    return listed(words, "look", _MAX_LISTED)
-
-
-@import_check(measures="files that an import left out")
-def import_dropped(run: CheckedRun) -> Iterator[Fault]:
-    """List the files that were given to the import and are not in the run."""
-    return listed([f"{bag.name}: {bag.reason}" for bag in _import_file(run).skipped], "look", _MAX_LISTED)
-
-
-def _import_file(run: CheckedRun) -> ImportFile:
+    """List the findings of the import, and the files that were given to it and are not in the run."""
     if (found := load_import_file(run.path)) is None:
         raise NotApplicableError("the run was not imported")
-    return found
+    words = [
+        f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
+        for bag in found.bags
+        for finding in bag.odd
+    ]
+    words += [f"{bag.name}: {bag.reason}" for bag in found.skipped]
+    return listed(words, "look", _MAX_LISTED)

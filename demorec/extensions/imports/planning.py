@@ -65,6 +65,10 @@ def plan_bag(bag: Bag, files: Files, settings: ImportSettings) -> PlannedBag:
         except BagError as error:
             raise BagError(f"The bag yields no complete episode: {error}{_reported(findings)}") from error
         info = _info(bag, files, lines, rows, settings)
+        if wrong := list(_problems(info, rows, settings.video)):
+            raise FieldError("; ".join(wrong))
+    except FieldError as error:
+        raise BagError(f"The episode cannot be recorded: {error}: {bag.path}") from error
     except BagError as error:
         raise BagError(f"{error}: {bag.path}") from error
     times_ns, begin_ns = rows.table.time_ns, lines.begin_ns
@@ -92,28 +96,22 @@ def _reported(findings: Sequence[ImportFinding]) -> str:
 
 
 def _info(bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, settings: ImportSettings) -> EpisodeInfo:
-    """Describe the episode; BagError if it cannot be recorded, before anything of the bag is written."""
+    """Describe the episode; BagError or FieldError if the bag has no robot description or task."""
     mapping, urdf = settings.mapping, settings.urdf
     if topic := mapping.robot.urdf_topic:
         urdf = lines.streams.urdf
         if not isinstance(urdf, str) or not urdf.strip():
             raise BagError(f"{topic} holds no robot description")
-    try:
-        info = imported_info(
-            mapping,
-            episode_index=0,
-            instruction=stated_task(mapping.task, bag.name),
-            urdf=urdf,
-            fps=mapping.clock.fps,
-            features=(_feature(name, values.dtype, lines) for name, values in rows.table.features.items()),
-            cameras=(_camera(name, plan, lines) for name, plan in rows.cameras.items()),
-            files=(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
-        )
-        if wrong := list(_problems(info, rows, settings.video)):
-            raise FieldError("; ".join(wrong))
-    except FieldError as error:
-        raise BagError(f"The episode cannot be recorded: {error}") from error
-    return info
+    return imported_info(
+        mapping,
+        episode_index=0,
+        instruction=stated_task(mapping.task, bag.name),
+        urdf=urdf,
+        fps=mapping.clock.fps,
+        features=(_feature(name, values.dtype, lines) for name, values in rows.table.features.items()),
+        cameras=(_camera(name, plan, lines) for name, plan in rows.cameras.items()),
+        files=(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
+    )
 
 
 def _feature(name: str, dtype: DTypeLike, lines: Timelines) -> Feature:

@@ -101,9 +101,6 @@ class Stream:
     def _add_vector(self, vector: NDArray[np.floating[Any]]) -> None:
         if self.dtype is None:
             self.dtype = vector.dtype
-        elif self.dtype != vector.dtype:  # float64 holds both
-            self.vectors = bytearray(np.frombuffer(self.vectors, self.dtype).astype(np.float64).data)
-            self.dtype = np.dtype(np.float64)
         self.vectors += vector.astype(self.dtype, copy=False).data
 
     def __len__(self) -> int:
