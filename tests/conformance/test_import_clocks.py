@@ -122,7 +122,7 @@ def test_simulated_time(mapping: str, imports: Imports, tmp_path: Path) -> None:
         assert times == [note.header_ns for note in bags.of_topic(notes, FRONT)]
 
 
-WITH_GRIPPER = f'{MAPPING}[[features."observation.state"]]\ntopic = "{GRIPPER}"\nfield = "data"\nprefix = "g"\n'
+WITH_GRIPPER = f'{MAPPING}[[features."observation.state"]]\ntopic = "{GRIPPER}"\nfield = "data"\nnames = ["g"]\n'
 
 
 def test_only_the_source_without_headers_uses_recording_times(imports: Imports, tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_an_action_of_the_next_state_and_a_gripper_command(imports: Imports, tmp
     """Joint actions are the next state; gripper actions are the latest command of a separate topic, row by row."""
     notes = real(3.0)
     mapping = MAPPING.replace('topic = "/joint_command"\nfield = "position"\n', 'next = "observation.state"\n')
-    mapping += f'[[features.action]]\ntopic = "{GRIPPER}"\nfield = "data"\nprefix = "g"\n'
+    mapping += f'[[features.action]]\ntopic = "{GRIPPER}"\nfield = "data"\nnames = ["g"]\n'
     code, told, error = imports(notes, mapping)
     assert code == 0, told + error
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:

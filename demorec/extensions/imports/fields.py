@@ -262,7 +262,7 @@ def names_of(source: Source, labels: Sequence[str], place: str) -> tuple[str, ..
     """Names in the feature of the selected elements; FieldError if their numbers differ."""
     if source.names and len(source.names) != len(labels):
         raise FieldError(f"names: {len(source.names)} given for the {len(labels)} elements of {place}")
-    return tuple(source.prefix + name for name in source.names or labels)
+    return tuple(source.names or labels)
 
 
 def _names_beside(values: Values, steps: tuple[Step, ...]) -> list[tuple[tuple[Step, ...], list[str]]]:

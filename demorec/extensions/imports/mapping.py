@@ -54,14 +54,12 @@ class Source:
         dataset: Dataset of the numbers below the episode's group, for HDF5 files: (T, D) or (T,).
         elements: Elements by number, in this order (auto: all).
         names: Names of the elements in the feature (auto: the source's names).
-        prefix: Prefix of each name, for two arms with the same names.
         unit: Unit of the numbers, which stay bit-exact.
         next: Instead of a source: a feature to take from the next row.
     """
 
     elements: tuple[int, ...] = ()
     names: tuple[str, ...] = ()
-    prefix: str = ""
     unit: Unit = ""
     next: str = ""
     topic: str = _bag("")

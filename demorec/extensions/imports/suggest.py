@@ -296,7 +296,7 @@ def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequ
 
 
 def _sources(feature: str, parts: Sequence[_Part], topics: Mapping[str, _Topic]) -> Iterator[str]:
-    """Sources of a feature; if names clash, with prefixes from the words that distinguish their topics."""
+    """Sources of a feature; if names clash, with names that begin with the words that distinguish their topics."""
     for number, part in enumerate(parts, 1):
         rivals = [other for other in parts if other is not part and {*part.names} & {*other.names}]
         own = [word for word in part.words if not all(word in rival.words for rival in rivals)]
@@ -305,9 +305,10 @@ def _sources(feature: str, parts: Sequence[_Part], topics: Mapping[str, _Topic])
         yield from (f"topic = {quoted(part.topic)}", f"field = {quoted(part.field)}")
         if part.joints:
             yield f"joints = [{', '.join(map(quoted, part.joints))}]"
-        elif part.kind == "gripper" and len(part.names) == 1:
-            yield f"names = [{quoted(part.names[0])}]"
         if rivals:
-            yield f"prefix = {quoted('_'.join(own or [str(number)]) + '_')}"
+            names = ("_".join([*(own or [str(number)]), name]) for name in part.names)
+            yield f"names = [{', '.join(map(quoted, names))}]"
+        elif part.kind == "gripper" and not part.joints and len(part.names) == 1:
+            yield f"names = [{quoted(part.names[0])}]"
         if topic.row_rate_hz and (age_s := 2 / topic.row_rate_hz) > Clock(fps=1).max_age_s:
             yield f"max_age_s = {math.ceil(age_s * 10) / 10:.1f}  # its messages are that far apart"
