@@ -106,7 +106,7 @@ def test_actions_are_the_radians_of_the_recording(run: Path, dataset: Path) -> N
     """A count is 0.088 degrees."""
     with Recording(next((run / "episodes").iterdir())) as recording:
         trajectory = recording.trajectory()
-        jaw = recording.info.simulated.robot.gripper.joint_position(trajectory.action_gripper)
+        jaw = recording.info.simulated.robot.gripper.joint_position(trajectory.action_gripper)[:, 0]
     _, action = columns(dataset)
     assert np.abs(action[:, :5] - np.degrees(trajectory.action_joint_target)).max() < 0.1
     assert np.abs(action[:, 5] - 100 * (jaw - JAW[0]) / (JAW[1] - JAW[0])).max() < 0.1
