@@ -205,7 +205,7 @@ def test_names_keep_their_form(
 def test_splits_are_kept_where_episodes_keep_their_numbers(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    splits, text = {"train": "0:2", "val": "2:4"}, "info.json states the splits"
+    splits, text = {"train": "0:1", "val": "1:2"}, "info.json states the splits"
     for name, is_cut_off in (("a", False), ("b", True)):
         root = Path(shutil.copytree(whole, tmp_path / name))
         info(splits=splits, total_tasks=0)(root)
