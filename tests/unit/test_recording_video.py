@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
+import av
 import numpy as np
 import pytest
 from support.recording import Codec, make_episode
@@ -47,6 +51,37 @@ def test_a_size_that_differs_from_the_settings() -> None:
     packet = VideoPacket(frame_index=0, time_ns=0, data=data, is_keyframe=True)
     with pytest.raises(RecordingError, match="An image is 32x32 pixels, but the metadata states 64x48"):
         list(decode(encoder.settings, [packet]))
+
+
+class WithoutVectors:
+    """A context of x264 that uses no vector instructions."""
+
+    create = av.CodecContext.create
+
+    def __init__(self, *words: Any) -> None:
+        self.__dict__["context"] = WithoutVectors.create(*words)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.context, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "options":
+            value = {**value, "x264-params": value["x264-params"] + ":asm=0"}
+        setattr(self.context, name, value)
+
+
+def test_packets_do_not_depend_on_the_instructions_of_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    times, rows, columns = np.mgrid[0:12, 0:224, 0:224]
+    waves = 128 + 100 * np.sin(rows / 9 + times / 3) * np.cos(columns / 13 - times / 5)
+    images = np.stack([waves, np.roll(waves, 40, axis=2), 255 - waves], axis=-1).astype(np.uint8)
+
+    def encoded() -> list[bytes]:
+        encoder = make_encoder(video=VideoConfig(), width=224, height=224, fps=30)
+        return [packet for image in images for packet in encoder.encode(image)] + encoder.finish()
+
+    before = encoded()
+    monkeypatch.setattr(av, "CodecContext", SimpleNamespace(create=WithoutVectors))
+    assert encoded() == before
 
 
 @pytest.mark.parametrize(("codec", "decoder"), [("h264", "h264"), ("av1", "libdav1d")])
