@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import say, size_in_words, tell
 from demorec.cli.shared.paths import (
-    WHAT_IS_READ,
     MappingFile,
     NamedByFlags,
+    Readable,
     RoleFlags,
     places_read,
     reading,
@@ -24,12 +23,11 @@ from demorec.cli.shared.paths import (
     tell_incomplete,
     tell_unfinished,
 )
-from demorec.core.atomic import atomic_write, atomic_write_all
+from demorec.core.atomic import atomic_write_all
 from demorec.core.errors import ConfigError, check_option
-from demorec.core.replacing import IMAGE, RERUN_FILE, OptionalTarget
+from demorec.core.replacing import RERUN_FILE, OptionalTarget
 from demorec.core.tables import RANKINGS
 from demorec.robots.assets import allow_models
-from demorec.runs.find import expect
 
 if TYPE_CHECKING:
     from demorec.view.sources import PlaybackSource
@@ -43,21 +41,19 @@ _RANK_HELP = f"Order of the episodes, the worst first: {', '.join(RANKINGS.names
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """View episodes in Rerun: recordings, runs, exported datasets, and .rrd files of --save.
+    """View episodes in Rerun: recordings, runs and exported datasets.
 
-    Opens a window; --save, --screenshot and --web need no screen. Rerun's ffmpeg for H.264 is included; a plain `rerun
-    FILE.rrd` plays H.264 only if ffmpeg is on the PATH.
+    Opens a window; --save and --web need no screen. Rerun's ffmpeg for H.264 is included; a plain `rerun FILE.rrd`
+    plays H.264 only if ffmpeg is on the PATH.
 
     Examples:
       demorec view recordings/cubes
-      demorec view episode_000003.mcap --screenshot cube.png --at 2.5
       demorec view datasets/cubes --episodes 0:10 --web
       demorec view datasets/cubes --rank score
       demorec view recordings/cubes --save cubes.rrd
-      demorec view cubes-0000.rrd
     """
 
-    paths: Annotated[Positional[tuple[Path, ...]], arg(help=f"Any of: {WHAT_IS_READ}, .rrd files.")]
+    paths: Readable
     mapping: MappingFile = None
     episodes: str = ""
     """Episodes to show, counted from 0: 7, or 0:20, or 3,5,8:10; default: the first 50."""
@@ -66,12 +62,6 @@ class View:
     """Also show the failed attempts of a run."""
     save: OptionalTarget = None
     """Write an .rrd file (layout included) instead of opening a window; several episodes: NAME-0000.rrd and so on."""
-    screenshot: OptionalTarget = None
-    """Write a screenshot (.png) of the viewer with the first episode instead of opening a window."""
-    at: float | None = None
-    """Time of the screenshot in the episode, in seconds (auto: its middle)."""
-    size: tuple[int, int] = (1600, 950)
-    """Width and height of the screenshot in pixels."""
     web: bool = False
     """Serve Rerun's web viewer on this machine and print its address; Ctrl-C stops it."""
     port: int | None = None
@@ -79,15 +69,13 @@ class View:
     allow: Allow = ()
     """A module or package of your own; models of robots and objects next to it may be read."""
     overwrite: bool = False
-    """Replace an existing file of --save or --screenshot."""
+    """Replace existing files of --save."""
     roles: NamedByFlags = field(default_factory=RoleFlags)
 
     def run(self) -> int:
-        """Convert, then show, save, take a screenshot, or serve."""
+        """Convert, then show, save or serve."""
         self._validate()
         allow_models(allowed_modules(self.allow))
-        if any(path.suffix == ".rrd" for path in self.paths):
-            return self._show_rrd()
         with reading(self.paths, self.mapping) as paths:
             return replace(self, paths=paths)._view()
 
@@ -104,25 +92,22 @@ class View:
         tell(*dict.fromkeys(note for source in sources for note in source.notes))
         if self.rank is not None:
             sources = self._ranked(sources)
-        if self.save is None and self.screenshot is None and not self.web:
+        if self.save is None and not self.web:
             need_screen()  # fail before minutes of conversion
         if len(sources) > _MOST and not self.episodes:
             tell(f"Showing the first {_MOST} of {len(sources)} episodes; --episodes chooses others.")
             sources = sources[:_MOST]
-        targets = [] if self.save is None else _numbered(self.save, len(sources))
-        refuse_inside(target for target in (*targets, self.screenshot) if target is not None)
-        with self._image() as image, tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
-            if targets:
-                self._save(sources, targets)
-                if image is None:
-                    return 0
-            shown = sources if image is None else sources[:1]
-            return self._show(save_each(shown, Path(folder)), sources, image)
+        if self.save is not None:
+            self._save(sources, _numbered(self.save, len(sources)))
+            return 0
+        with tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
+            return self._show(save_each(sources, Path(folder)))
 
     def _save(self, sources: Sequence[PlaybackSource], targets: Sequence[Path]) -> None:
         """Write all .rrd files; none appears before all are complete."""
         from demorec.view.scene import save
 
+        refuse_inside(targets)
         read = places_read(self.paths)
         with atomic_write_all(targets, RERUN_FILE, overwrite=self.overwrite, sources=read) as parts:
             for source, part in zip(sources, parts, strict=True):
@@ -130,17 +115,6 @@ class View:
         for source, target in zip(sources, targets, strict=True):
             of = f" ({source.name})" if len(targets) > 1 else ""
             say(f"{size_in_words(target.stat().st_size)}: {target}{of}")
-
-    @contextmanager
-    def _image(self) -> Iterator[Path | None]:
-        """Yield the path for the screenshot, which appears at the end; None if none is requested."""
-        if self.screenshot is None:
-            yield None
-            return
-        read = places_read(self.paths)
-        with atomic_write(self.screenshot, IMAGE, overwrite=self.overwrite, sources=read) as part:
-            yield part
-        say(f"{self.size[0]}x{self.size[1]}: {self.screenshot}")
 
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
         """Sort the episodes by --rank, and print the reasons for the first ones."""
@@ -155,59 +129,27 @@ class View:
     def _validate(self) -> None:
         if self.rank is not None:
             RANKINGS.check_name(self.rank)
-        if self.web and (self.save is not None or self.screenshot is not None):
-            raise ConfigError("--web serves until Ctrl-C: use --save or --screenshot in a separate call.")
         check_option("port", self.port, 1, 65535)
         if self.port is not None and not self.web:
             raise ConfigError("--port belongs to --web.")
-        if min(self.size) < 200 or max(self.size) > 8192:
-            raise ConfigError(f"--size is {self.size[0]} {self.size[1]}, allowed are 200 to 8192 pixels.")
-        for flag, target, suffix in (("--save", self.save, ".rrd"), ("--screenshot", self.screenshot, ".png")):
-            if target is None:
-                continue
-            if target.suffix != suffix:
-                raise ConfigError(f"{flag} writes a {suffix} file, found the name {target.name!r}.")
-            if not target.absolute().parent.is_dir():
-                raise ConfigError(f"{flag}: folder {target.parent} is missing.")
-
-    def _show_rrd(self) -> int:
-        others = [path for path in self.paths if path.suffix != ".rrd"]
-        if others:
-            raise ConfigError(f".rrd files need a separate call, without other paths: {others[0]}")
-        if self.save is not None or self.episodes or self.include_failures:
-            raise ConfigError("An .rrd file is shown unchanged: --save and --episodes are for recordings.")
-        for path in self.paths:
-            expect(path, "rrd")
-        refuse_inside([] if self.screenshot is None else [self.screenshot])
-        with self._image() as image:
-            return self._show(self.paths, (), image)
-
-    def _show(self, files: Sequence[Path], sources: Sequence[PlaybackSource], image: Path | None) -> int:
-        if image is not None:
-            from demorec.view.viewer import screenshot
-
-            width, height = self.size
-            screenshot(files[0], image, seconds=self._second(sources), width=width, height=height)
-            return 0
+        if self.save is None:
+            return
         if self.web:
-            from demorec.view.viewer import serve_web
+            raise ConfigError("--web serves until Ctrl-C: use --save in a separate call.")
+        if self.save.suffix != ".rrd":
+            raise ConfigError(f"--save writes a .rrd file, found the name {self.save.name!r}.")
+        if not self.save.absolute().parent.is_dir():
+            raise ConfigError(f"--save: folder {self.save.parent} is missing.")
 
-            with serve_web(files, web_port=self.port or 0) as (address, wait):
-                say(f"Open this in a browser on this machine (Ctrl-C ends it): {address}")
-                return 1 if wait() else 0
-        from demorec.view.viewer import show
+    def _show(self, files: Sequence[Path]) -> int:
+        from demorec.view.viewer import serve_web, show
 
-        show(files)
-        return 0
-
-    def _second(self, sources: Sequence[PlaybackSource]) -> float | None:
-        """Time of the screenshot; None leaves it to the viewer, which knows the duration of an .rrd file."""
-        from demorec.view.viewer import moment
-
-        if not sources:
-            return self.at
-        with sources[0].open() as episode:
-            return moment(self.at, max(episode.num_frames - 1, 0) / episode.info.fps)
+        if not self.web:
+            show(files)
+            return 0
+        with serve_web(files, web_port=self.port or 0) as (address, wait):
+            say(f"Open this in a browser on this machine (Ctrl-C ends it): {address}")
+            return 1 if wait() else 0
 
 
 def _numbered(target: Path, count: int) -> list[Path]:

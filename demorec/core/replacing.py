@@ -54,7 +54,6 @@ def _begins_with(*magics: bytes) -> Callable[[Path], bool]:
 
 RECORDING = ReplaceableKind(name="a recording (MCAP)", recognises=_begins_with(MCAP_MAGIC))
 RERUN_FILE = ReplaceableKind(name="a Rerun file (.rrd)", recognises=_begins_with(*RERUN_MAGICS))
-IMAGE = ReplaceableKind(name="an image (PNG)", recognises=_begins_with(b"\x89PNG\r\n\x1a\n"))
 REPORT_MARK = "<!doctype html>\n<!-- A report by demorec. -->\n"
 REPORT = ReplaceableKind(name="a report (HTML)", recognises=_begins_with(REPORT_MARK.encode()))
 

@@ -34,7 +34,7 @@ EVALUATION_NAME = "evaluation.json"
 _WORDS: dict[PathKind, tuple[str, str]] = {
     "recording": ("a recording (.mcap)", ""),
     "unfinished": ("an unfinished recording (.part)", "; demorec recover keeps its intact part"),
-    "rrd": ("a Rerun file (.rrd)", "; demorec view shows it if its name ends in .rrd"),
+    "rrd": ("a Rerun file (.rrd)", "; rerun shows it"),
     "hdf5": ("an HDF5 file", "; name the run that it was made from"),
     "rosbag": ("a bag of another program", ""),
     "run": ("a run", "; name one of its recordings"),

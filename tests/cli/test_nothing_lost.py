@@ -10,9 +10,7 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 from support.commands import exit_code
 from support.export import export, files_of, make_run
 from support.generate import run_fake
@@ -23,7 +21,7 @@ from demorec.core.atomic import atomic_write
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.files import LOCK_NAME
-from demorec.core.replacing import IMAGE, RECORDING, REPORT_MARK, check_replaceable
+from demorec.core.replacing import RECORDING, REPORT, REPORT_MARK, check_replaceable
 from demorec.core.tables import EXPORTERS
 from demorec.extensions.policies.evaluation import Evaluation, Settings, open_evaluation
 from demorec.generate import reproduce as reproducing
@@ -283,10 +281,9 @@ def test_a_file_with_the_name_of_an_evaluation_is_kept(evaluation: Path, content
     assert files_of(evaluation) == before
 
 
-# Commands that write recordings, and those that write images and .rrd files.
+# Commands that write recordings, .rrd files, pages and datasets.
 
 
-FRAME = "dataset/images/front/episode-000000/frame-000000.png"
 KEPT: dict[str, dict[str, str]] = {
     "recover broken.mcap --out": {
         "thesis.tex": "it is not a recording",
@@ -304,12 +301,6 @@ KEPT: dict[str, dict[str, str]] = {
         "dangling.rrd": "a link whose target is missing",
         "lock.rrd": "lock.rrd",
     },
-    "view alone.mcap --screenshot": {
-        "thesis.png": "it is not an image",
-        "link.png": "it is an input of this command",
-        "lock.png": "lock.png",
-    },
-    "view dataset --screenshot": {FRAME: "A new file inside a dataset would prevent"},
     "report alone.mcap --out": {
         "thesis.html": "it is not a report",
         "link.html": "it is an input of this command",
@@ -326,17 +317,14 @@ def full(place: Path) -> Path:
     """A home folder with a file under every name. An empty file may be another program's lock or marker."""
     (place / "broken.mcap").write_bytes((place / "alone.mcap").read_bytes()[:-500])
     shutil.copy(place / "alone.mcap", place / "alone.rrd")
-    for suffix in ("rrd", "png", "html", "json"):
+    for suffix in ("rrd", "html", "json"):
         (place / f"thesis.{suffix}").write_text('{"episodes": []}')
         (place / f"link.{suffix}").symlink_to(place / "alone.mcap")
         (place / f"dangling.{suffix}").symlink_to(place / "nothing")
         (place / f"folder.{suffix}").mkdir()
-    for name in ("lock", "lock.mcap", "lock.rrd", "lock.png", "lock.html"):
+    for name in ("lock", "lock.mcap", "lock.rrd", "lock.html"):
         (place / name).touch()
     (place / "dataset" / "report.html").write_text(REPORT_MARK)
-    for image in (FRAME, "photo.png"):
-        (place / image).parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(place / image)
     return place
 
 
@@ -367,13 +355,6 @@ def test_own_files_are_replaced_on_request(full: Path, capsys: pytest.CaptureFix
     for flags, code in (((), 0), ((), 2), (("--overwrite",), 0)):
         assert exit_code(*words, full / source, flag, full / OWN[command], *flags) == code
         assert ("--overwrite" in capsys.readouterr().err) == (code == 2)
-
-
-def test_a_screenshot_is_replaced_only_when_asked_for(full: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = files_of(full)
-    assert exit_code("view", full / "alone.mcap", "--screenshot", full / "photo.png") == 2
-    assert "--overwrite to replace it" in capsys.readouterr().err
-    assert files_of(full) == before
 
 
 def test_the_output_of_another_recovery_stays(full: Path) -> None:
@@ -427,7 +408,6 @@ def test_a_recording_replaces_recordings_only(place: Path, capsys: pytest.Captur
 PARTS = ("runs/other/episodes", "runs/other/failed", "runs/other/unfinished", "runs/other/failed/new")
 INSIDE: dict[str, Sequence[str]] = {
     "view alone.mcap --save": ("runs/other/episodes/v.rrd", "runs/other/failed/v.rrd", "dataset/data/v.rrd"),
-    "view alone.mcap --screenshot": ("runs/other/unfinished/v.png", "evaluation/episodes/v.png", "dataset/v.png"),
     "report alone.mcap --out": ("runs/other/episodes/v.html", "dataset/v.html"),
     "render alone.mcap --out": ("runs/other/episodes", "dataset", "evaluation/failed", "runs/other/episodes/x.mcap"),
     "replay alone.mcap --out": ("runs/other/episodes", "dataset/deep/er", "evaluation/failed"),
@@ -472,9 +452,9 @@ def test_special_files_are_never_replaced(tmp_path: Path) -> None:
 
 
 def test_a_third_party_unfinished_file_is_kept(tmp_path: Path) -> None:
-    part = tmp_path / ".x.png.demorec-part"
+    part = tmp_path / ".x.html.demorec-part"
     part.write_text("mine")
-    with pytest.raises(ConfigError, match="not made by demorec"), atomic_write(tmp_path / "x.png", IMAGE):
+    with pytest.raises(ConfigError, match="not made by demorec"), atomic_write(tmp_path / "x.html", REPORT):
         pass
     assert part.read_text() == "mine"
 

@@ -79,7 +79,7 @@ def test_texts_are_lines(option: Option, text: str, capsys: pytest.CaptureFixtur
 
 def test_every_path_is_read_or_a_target() -> None:
     paths = {option.name for option in OPTIONS if option.takes(Path)}
-    assert paths - READ_PATHS == {option.name for option in TARGETS} == {"out", "save", "screenshot"}
+    assert paths - READ_PATHS == {option.name for option in TARGETS} == {"out", "save"}
 
 
 @pytest.mark.parametrize("option", [pytest.param(o, id=f"{' '.join(o.command)} {o.name}") for o in TARGETS])

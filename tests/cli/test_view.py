@@ -1,4 +1,4 @@
-"""`demorec view` with the real viewer: images of recordings, runs and datasets; the browser."""
+"""`demorec view` with the real viewer and in the browser."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from support.commands import exit_code
 from support.recording import make_episode, write_episode
-from support.viewer import chromium, need_chromium, need_vulkan, num_colors, pixels
+from support.viewer import RerunViewer, chromium, need_chromium, need_vulkan, num_colors, pixels, rerun_viewer
 
 from demorec.core.config import VideoConfig
 from demorec.mcap import EpisodeWriter
 from demorec.view.scene import save_each
 from demorec.view.sources import find_episodes
-from demorec.view.viewer import HeadlessViewer, headless_viewer, serve_web
+from demorec.view.viewer import serve_web
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +37,13 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("cut.mcap.part", (), "demorec recover"),
         ("folder", (), "The folder holds no recording"),
         ("runs", (), "it holds runs: name one (cubes)"),
-        ("saved.rrd", ("--episodes", "0"), "is shown unchanged"),
-        ("nothing.rrd", (), "No such file"),
+        ("saved.rrd", (), "rerun shows it"),
+        ("nothing.mcap", (), "does not exist"),
         ("episode.mcap", ("--save", "x.mp4"), "writes a .rrd file"),
         ("episode.mcap", ("--port", "80"), "--port belongs to --web"),
         ("episode.mcap", ("--web", "--save", "x.rrd"), "--web serves"),
-        ("episode.mcap", ("--screenshot", "x.png", "--at", "-1"), "--at -1 is out of range: choose 0 to 0.133 s"),
+        ("episode.mcap", ("--save", "missing/x.rrd"), "folder missing is missing"),
+        ("episode.mcap", (), "No screen is available"),
     ],
 )
 def test_an_impossible_request_is_one_sentence(
@@ -54,8 +55,10 @@ def test_an_impossible_request_is_one_sentence(
     words: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     for file in ("video.mp4", "cut.mcap.part", "saved.rrd"):
-        Path(file).write_bytes(b"0123456789")
+        Path(file).write_bytes(b"RRF2")
     Path("folder").mkdir()
     Path("runs/cubes/episodes").mkdir(parents=True)
     write_episode(Path("episode.mcap"), num_frames=5, cameras=())
@@ -65,17 +68,17 @@ def test_an_impossible_request_is_one_sentence(
     assert len(said.strip().splitlines()) == 1
 
 
-def _check_views(viewer: HeadlessViewer) -> None:
+def _check_views(viewer: RerunViewer) -> None:
     """Check that no view reports an error, that the 3D view shows robot, table and frusta, and that each camera shows
     its moving red square.
     """
     assert viewer.reports() == []
-    world = pixels(viewer.view_image("pick_place: the world"))
+    world = viewer.view_image("pick_place: the world")
     assert num_colors(world) > 100
     white = (world.min(axis=2) > 150).mean()
     assert white > 0.005, "no robot"
     for camera in ("front", "wrist"):
-        image = pixels(viewer.view_image(f"{camera} camera")).astype(int)
+        image = viewer.view_image(f"{camera} camera").astype(int)
         red = (image[..., 0] > 150) & (image[..., 1] < 90) & (image[..., 2] < 90)
         assert red.mean() > 0.01, f"no video of {camera}"
 
@@ -85,14 +88,14 @@ def _check_views(viewer: HeadlessViewer) -> None:
 def test_the_viewer_shows_a_run(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()
     files = save_each(find_episodes([run_folder]), tmp_path)
-    with headless_viewer(files[0]) as viewer:
+    with rerun_viewer(files[0]) as viewer:
         viewer.seek(1.0)
         _check_views(viewer)
         state = viewer.client.get_state()
         assert {recording.current_time for recording in state.recordings} == {1_000_000_000}
-        before = pixels(viewer.view_image("front camera"))
+        before = viewer.view_image("front camera")
         viewer.seek(0.2)
-        after = pixels(viewer.view_image("front camera"))
+        after = viewer.view_image("front camera")
     assert before.shape == after.shape
     assert np.abs(before.astype(int) - after).mean() > 1.0, "the video does not move"
 
@@ -110,23 +113,11 @@ def test_the_viewer_shows_the_colours_that_were_recorded(codec: Literal["av1", "
         for frame in frames:
             writer.write(replace(frame, images={"front": replace(frame.images["front"], color=image)}))
         writer.finish(outcome)
-    with headless_viewer(save_each(find_episodes([tmp_path]), tmp_path)[0]) as viewer:
+    with rerun_viewer(save_each(find_episodes([tmp_path]), tmp_path)[0]) as viewer:
         viewer.seek(0.5)
-        shown = pixels(viewer.view_image("front camera"))
+        shown = viewer.view_image("front camera")
     height, width = shown.shape[:2]
     np.testing.assert_allclose(shown[height // 2, width // 8 :: width // 4][:4], colours, atol=4)
-
-
-@pytest.mark.slow
-@pytest.mark.viewer
-def test_a_screenshot_of_a_saved_file(run_folder: Path, tmp_path: Path) -> None:
-    need_vulkan()
-    episode = run_folder / "episodes" / "episode_000000.mcap"
-    assert exit_code("view", episode, "--save", tmp_path / "x.rrd") == 0
-    assert exit_code("view", tmp_path / "x.rrd", "--screenshot", tmp_path / "x.png", "--size", 900, 600) == 0
-    image = pixels((tmp_path / "x.png").read_bytes())
-    assert image.shape == (600, 900, 3)
-    assert num_colors(image) > 200
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from demorec.cli import main
@@ -82,21 +81,6 @@ def with_stand_in_policy(words: list[str]) -> None:
     main(words)
 
 
-def with_stand_in_viewer(words: list[str]) -> None:
-    """Save a screenshot without a viewer; other tests use a real one where a driver exists."""
-    from PIL import Image
-
-    from demorec.view import viewer
-
-    def screenshot(recording: Path, target: Path, *, seconds: float | None, width: int, height: int) -> None:
-        assert recording.is_file()
-        noise = np.random.default_rng(width).integers(0, 256, (height, width), np.uint8)
-        Image.fromarray(noise).save(target, format="PNG")
-
-    viewer.screenshot = screenshot
-    main(words)
-
-
 def without_lerobot(words: list[str]) -> None:
     """Skip the verification by LeRobot, which takes seconds to start."""
     sys.modules["lerobot"] = None  # type: ignore[assignment]
@@ -166,12 +150,6 @@ ROWS = {
         call="view SOURCES/run --episodes 0 --save new.rrd",
         targets=("new.rrd",),
         old="view SOURCES/run --episodes 1 --save new.rrd",
-    ),
-    "screenshot": Row(
-        call="view SOURCES/run --episodes 0 --screenshot new.png",
-        targets=("new.png",),
-        old="view SOURCES/run --episodes 1 --screenshot new.png --size 300 200",
-        program=with_stand_in_viewer,
     ),
     "replay": Row(
         call="replay SOURCES/e.mcap --out new",

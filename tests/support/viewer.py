@@ -8,6 +8,7 @@ import io
 import json
 import os
 import shutil
+import socket
 import subprocess
 import tempfile
 import time
@@ -18,8 +19,13 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
+import rerun_cli
 from numpy.typing import NDArray
 from PIL import Image
+from rerun.experimental import ViewerClient
+
+from demorec.view.paths import SECONDS
+from demorec.view.viewer import viewer_environment
 
 VULKAN_DRIVERS = Path("/usr/share/vulkan/icd.d")
 
@@ -50,6 +56,57 @@ def pixels(png: bytes) -> NDArray[np.uint8]:
 
 def num_colors(image: NDArray[np.uint8]) -> int:
     return len(np.unique(image.reshape(-1, 3) // 8, axis=0))
+
+
+@contextlib.contextmanager
+def rerun_viewer(file: Path) -> Iterator[RerunViewer]:
+    """Show an .rrd file in Rerun's viewer without a screen."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    program = str(Path(rerun_cli.__file__).with_name("rerun"))
+    flags = ["--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", "1600x950"]
+    process = subprocess.Popen([program, *flags, str(file)], env=viewer_environment(), stderr=subprocess.DEVNULL)
+    try:
+        yield RerunViewer(port, process)
+    finally:
+        process.kill()
+        process.wait()
+
+
+class RerunViewer:
+    """A viewer that has loaded its file."""
+
+    def __init__(self, port: int, process: subprocess.Popen[bytes]) -> None:
+        deadline = time.monotonic() + 60
+        while True:
+            assert process.poll() is None, "the viewer has ended"
+            assert time.monotonic() < deadline, "the viewer has not loaded the file"
+            time.sleep(0.2)
+            with contextlib.suppress(OSError, RuntimeError, ValueError):
+                self.client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+                state = self.client.get_state()
+                if not state.loading and any(recording.timelines for recording in state.recordings):
+                    return
+
+    def seek(self, seconds: float) -> None:
+        """Pause at a time, until the image no longer changes (videos are decoded)."""
+        for recording in self.client.get_state().recordings:
+            self.client.set_time(timeline=SECONDS, duration=seconds, play_state="paused", recording=recording.store_id)
+        before, same, deadline = b"", 0, time.monotonic() + 30
+        while same < 3 and time.monotonic() < deadline:
+            time.sleep(0.4)
+            now = bytes(self.client.take_screenshot())
+            before, same = now, same + 1 if now == before else 0
+
+    def view_image(self, name: str) -> NDArray[np.uint8]:
+        """Pixels of one view."""
+        (number,) = (view.view_id for view in self.client.get_state().views if view.name == name)
+        return pixels(bytes(self.client.take_screenshot(number)))
+
+    def reports(self) -> list[tuple[str, Any]]:
+        """Every warning and error of a view: (its name, Rerun's report)."""
+        return [(view.name, report) for view in self.client.get_state().views for report in view.reports]
 
 
 @contextlib.contextmanager

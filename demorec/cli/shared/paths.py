@@ -64,7 +64,7 @@ def tell_incomplete(paths: Iterable[Path]) -> None:
 def places_read(paths: Sequence[Path]) -> list[Path]:
     """Files and folders of recordings, runs and datasets in which an image may be part of the data.
 
-    A run's own folder is not among them: an .rrd file or an image next to its recordings may be replaced.
+    A run's own folder is not among them: an .rrd file next to its recordings may be replaced.
     """
     return [path / DATASET if find(path).kind in EPISODE_FOLDERS else path for path in paths]
 
