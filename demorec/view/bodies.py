@@ -11,14 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from demorec.core.errors import DemorecError, as_reason
 from demorec.core.files import read_text_limited
-from demorec.core.geometry import Array
-from demorec.episode.scene import Body, Scene, Shape, Texture
+from demorec.episode.scene import Body, Scene, Shape
 from demorec.mcap.transforms import MovingJoints
-from demorec.render.procedural import texture_pixels
 from demorec.render.raster.mesh import RasterMesh
 from demorec.robots.assets import asset_path, known_model, surface_file
 from demorec.robots.urdf import MAX_BYTES, Urdf
@@ -58,8 +55,6 @@ def log_bodies(recording: rr.RecordingStream, episode: Playback, scene: Scene) -
 
 def _visible(body: Body, episode: Playback) -> rr.Mesh3D:
     shape, color = body.shape, body.mean_color
-    if shape.kind == "box" and body.texture is not None:
-        return _textured_box(np.array(shape.size), body.texture)
     if shape.kind not in ("mesh", "urdf"):
         return as_mesh3d(placed(primitive(shape.kind, shape.size), rgba=color))
     mesh = _installed_mesh(shape)
@@ -90,26 +85,6 @@ def _model_mesh(shape: Shape) -> RasterMesh:
     poses = Urdf.parse(text, scale=shape.scale).link_poses({})
     links = urdf_meshes(text, path.parent, shape.scale)
     return joined([placed(mesh, poses[link]) for link, mesh in links.items()])
-
-
-def _textured_box(size: Array, texture: Texture) -> rr.Mesh3D:
-    """Make a box that shows the texture once on each face."""
-    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-    vertices, normals = np.zeros((24, 3)), np.zeros((24, 3))
-    for face in range(6):
-        axis, sign = divmod(face, 2)
-        rows = slice(4 * face, 4 * face + 4)
-        normals[rows, axis] = vertices[rows, axis] = 2 * sign - 1
-        vertices[rows, (axis + 1) % 3], vertices[rows, (axis + 2) % 3] = corners.T
-    quads = np.arange(0, 24, 4)[:, None]
-    triangles: NDArray[np.int64] = np.concatenate([quads + np.array([0, 1, 2]), quads + np.array([0, 2, 3])])
-    return rr.Mesh3D(
-        vertex_positions=vertices * size / 2,
-        vertex_normals=normals,
-        vertex_texcoords=np.tile((corners + 1) / 2, (6, 1)),
-        triangle_indices=triangles,
-        albedo_texture=texture_pixels(texture, 512),
-    )
 
 
 _SAME_PLACE = 1e-3

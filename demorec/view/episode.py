@@ -42,7 +42,6 @@ class Playback:
         name: Name in the list of recordings.
         group: Run or dataset that contains it.
         identity: Unique identifier.
-        source: Its origin, in readable form.
         data: The episode.
         motion: Motion of its robot and scene.
         roles: Roles of its features.
@@ -54,7 +53,6 @@ class Playback:
     name: str
     group: str
     identity: str
-    source: str
     data: Episode
     motion: SceneMotion
     roles: Roles
@@ -155,7 +153,7 @@ def feature_curves(episode: Episode, roles: Roles) -> dict[str, Curves]:
     return {feature.name: Curves(features[feature.name].astype(np.float64), feature.names) for feature in ordered}
 
 
-def simulated_curves(episode: Episode, motion: SceneMotion, *, has_targets: bool = True) -> dict[str, Curves]:
+def simulated_curves(episode: Episode) -> dict[str, Curves]:
     """Compute the curves of a simulated episode; a missing observation has none.
 
     They are "position" and "velocity" of the arm's joints, "gripper" (m), "ee" (m) and those of its sensors, split by
@@ -163,21 +161,21 @@ def simulated_curves(episode: Episode, motion: SceneMotion, *, has_targets: bool
     """
     info = episode.info
     features = {name: values.astype(np.float64) for name, values in episode.table().features.items()}
+    names = {feature.name: feature.names for feature in info.features}
     joints = info.simulated.robot.arm_joints
     count = len(joints)
     shown = {"position": Curves(features[STATE][:, :count], joints)}
     if VELOCITY in features:
         shown["velocity"] = Curves(features[VELOCITY][:, :count], joints)
-    if has_targets:
+    if names[ACTION] == names[STATE]:
         shown["target"] = Curves(features[ACTION][:, :count], joints)
     for feature in on_request(info):
         for unit in dict.fromkeys(feature.units) if feature.name in features else ():
             columns = [number for number, other in enumerate(feature.units) if other == unit]
             title = f"{feature.name.removeprefix('observation.')} ({unit})"
-            names = tuple(feature.names[number] for number in columns)
-            shown[title] = Curves(features[feature.name][:, columns], names)
+            shown[title] = Curves(features[feature.name][:, columns], tuple(feature.names[n] for n in columns))
     shown["gripper"] = Curves(features[STATE][:, count : count + 1], ("opening",))
     shown["gripper target"] = Curves(features[ACTION][:, -1:], ("target",))
-    tcp = features[EE_POSE] if motion.base_from_tcp is None else motion.base_from_tcp
-    shown["ee"] = Curves(tcp[:, :3], ("x", "y", "z"))
+    if EE_POSE in features:
+        shown["ee"] = Curves(features[EE_POSE][:, :3], ("x", "y", "z"))
     return shown

@@ -16,74 +16,53 @@ import numpy as np
 
 from demorec.core.errors import RecordingError, describe_error, resource_error
 from demorec.core.geometry import Array, Pose
-from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.recording import DatasetRecording, with_robot
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.protocol import SceneMotion
 from demorec.episode.validity import read_episode_info
-from demorec.robots.assets import asset_path
-from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.robot import RobotSpec
-from demorec.robots.urdf import Urdf, check_primitives
+from demorec.robots.urdf import check_primitives
 from demorec.view.episode import Playback, feature_curves, simulated_curves
 
 
 @contextmanager
-def open_stored_episode(dataset: LeRobotFolder, number: int) -> Iterator[DatasetRecording]:
-    """Open one episode of a dataset by its index, from 0, with scene and outcome as far as they are known.
-
-    Raises:
-        RecordingError: It cannot be read; also in the block.
-    """
-    try:
-        episode = _ShownEpisode(dataset, number)
-        has_state = {STATE, ACTION} <= dataset.info.features.keys()
-        has_scene = episode.known.get("root_seed") is not None and has_state
-        yield _SimulatedEpisode(dataset, number) if has_scene else episode
-    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and unexpected values in its tables
-        unreadable = RecordingError(f"The dataset cannot be read ({describe_error(error)}): {dataset.root}")
-        raise resource_error(error) or unreadable from error
-
-
-@contextmanager
 def open_dataset_episode(dataset: LeRobotFolder, number: int) -> Iterator[Playback]:
-    """Open one episode of a dataset by its index, from 0.
+    """Open one episode of a dataset by its index, from 0, with scene and outcome as far as they are known.
 
     Raises:
         ConfigError: It lacks a feature that the user named.
         RecordingError: It cannot be read.
     """
-    with open_stored_episode(dataset, number) as data:
-        episode = _playback(dataset, data)
+    try:
+        episode = _playback(dataset, number)
+    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and unexpected values in its tables
+        unreadable = RecordingError(f"The dataset cannot be read ({describe_error(error)}): {dataset.root}")
+        raise resource_error(error) or unreadable from error
     yield episode
 
 
-def _playback(dataset: LeRobotFolder, data: DatasetRecording) -> Playback:
-    root, group = dataset.root, dataset.root.resolve().name
+def _playback(dataset: LeRobotFolder, number: int) -> Playback:
+    root = dataset.root.resolve()
+    data: DatasetRecording = _ShownEpisode(dataset, number)
+    has_scene = data.known.get("root_seed") is not None and {STATE, ACTION} <= dataset.info.features.keys()
+    if has_scene:
+        data = _SimulatedEpisode(dataset, number)
     index, last = data.place.episode_index, data.num_frames - 1
-    if isinstance(data, _SimulatedEpisode):
-        motion, identity = data.motion(), f"dataset-{group}-{index}"
-        curves = simulated_curves(data, motion, has_targets=data.has_targets)
-    else:
-        motion, identity = data.motion(), hashlib.sha256(f"{root.resolve()} {index}".encode()).hexdigest()[:16]
-        curves = feature_curves(data, dataset.roles)
     statements = tuple(
         (min(round(row["timestamp"] * dataset.info.fps), last), str(row["style"]), str(row["content"]))
         for row in data.spoken.persistent
     )
     return Playback(
         name=f"episode_{index:06d}",
-        group=group,
-        identity=identity,
-        source=str(data.known.get("source", group)),
+        group=root.name,
+        identity=hashlib.sha256(f"{root} {index}".encode()).hexdigest()[:16],
         data=data,
-        motion=motion,
+        motion=data.motion(),
         roles=dataset.roles,
-        curves=curves,
+        curves=simulated_curves(data) if has_scene else feature_curves(data, dataset.roles),
         statements=statements,
     )
 
@@ -101,14 +80,12 @@ class _ShownEpisode(DatasetRecording):
 class _SimulatedEpisode(DatasetRecording):
     """An episode simulated by demorec, with scene and outcome from the sidecar.
 
-    `has_targets` states whether its actions are joint targets. Raises ValueError, TypeError, KeyError or IndexError for
-    unexpected values in its tables.
+    Raises ValueError, TypeError, KeyError or IndexError for unexpected values in its tables.
     """
 
     def __init__(self, dataset: LeRobotFolder, number: int) -> None:
         super().__init__(dataset, number)
         (self._row,) = dataset.sidecar_rows("episodes", self.place.episode_index)
-        self.has_targets = read_json(self.path / SIDECAR_DIR / "export.json").get("action") == "joint"
         self._phases = _phases(self._row, self.num_frames)
         if self.robot is not None:
             check_primitives(self.robot.urdf)
@@ -138,38 +115,22 @@ class _SimulatedEpisode(DatasetRecording):
         """Return the robot's URDF; "" if unknown, and for bodies."""
         return "" if body or self.robot is None else self.robot.urdf
 
-    def distances(self, camera: str) -> Iterator[Any]:
-        """Yield a depth camera's images in order, (H, W) uint16 millimetres, half the size of float metres."""
-        for metres in super().distances(camera):
-            yield np.rint(metres * 1000).clip(0, 65535).astype(np.uint16)
-
     def motion(self) -> SceneMotion:
         """Read the motion of the robot and, if the dataset has it, of objects and cameras."""
         data = {name: values.astype(np.float64) for name, values in self.table().features.items()}
         state, count = data[STATE], len(self._spec.arm_joints)
         fingers = self._spec.gripper.joint_position(state[:, count])
-        base_from_tcp = data[EE_POSE] if EE_POSE in data else self._tcp_poses(state)
         ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in self._row["objects"]}
         poses = self._object_poses(data[ENVIRONMENT_STATE]) if ENVIRONMENT_STATE in data else {}
         rows = self.dataset.sidecar_rows("camera_poses", self.place.episode_index)
         moving = [name for name in (rows[0] if rows else {}) if name not in ("episode_index", "frame_index")]
         return SceneMotion(
             joint_position=dict(zip(self._spec.joint_names, [*state[:, :count].T, *fingers.T], strict=True)),
-            base_from_tcp=base_from_tcp,
+            base_from_tcp=data.get(EE_POSE),
             object_poses=poses,
             end_poses=ends,
             world_from_camera={name: np.array([row[name] for row in rows]) for name in moving},
         )
-
-    def _tcp_poses(self, state: Array) -> Array:
-        """Compute (T, 7) TCP poses from the joints if the dataset has no observation.ee_pose."""
-        spec = self._spec
-        if self.robot is None:
-            urdf = Urdf.load(asset_path(spec.urdf), scale=self.info.simulated.scene.robot.scale)
-        else:
-            urdf = self.robot.model
-        arm = ArmKinematics(urdf, spec)
-        return np.array([arm.forward(row).vector() for row in state[:, : arm.num_joints]])
 
     def _object_poses(self, values: Array) -> dict[str, Array]:
         """Read name -> (T, 7) from the rows of `observation.environment_state`."""

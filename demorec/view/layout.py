@@ -30,8 +30,8 @@ _FLOOR = 3.0
 """Minimum width, metres, of a body that counts as the floor, which would only hide the grid."""
 
 
-def episode_layout(episode: Playback, *, is_alone: bool = False) -> rrb.Blueprint:
-    """Build the layout of one episode, or of all with the same streams; a single one needs no list of episodes."""
+def episode_layout(episode: Playback) -> rrb.Blueprint:
+    """Build the layout of one episode, or of all with the same streams."""
     is_known = episode.scene is not None or bool(episode.info.urdf)
     three_d, cameras = [_view_3d(episode)] if is_known else [], _camera_views(episode)
     top: list[rrb.View | rrb.Container] = [*three_d]
@@ -52,7 +52,7 @@ def episode_layout(episode: Playback, *, is_alone: bool = False) -> rrb.Blueprin
     return rrb.Blueprint(
         rrb.Vertical(*parts, row_shares=shares),
         rrb.TimePanel(state="collapsed", timeline=SECONDS, fps=float(episode.info.fps), loop_mode="all"),
-        rrb.BlueprintPanel(state="collapsed" if is_alone else "expanded"),
+        rrb.BlueprintPanel(state="expanded"),
         rrb.SelectionPanel(state="hidden"),
         auto_layout=False,
         auto_views=False,

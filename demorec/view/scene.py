@@ -49,18 +49,9 @@ def log_episode(recording: rr.RecordingStream, episode: Playback) -> None:
 
 
 def new_recording(episode: Playback) -> rr.RecordingStream:
-    """Create an empty Rerun recording with the episode's name and properties."""
+    """Create an empty Rerun recording with the episode's name."""
     recording = rr.RecordingStream(_application_id(episode), recording_id=f"{episode.name}-{episode.identity}")
     recording.send_recording_name(_entry(episode))
-    properties = {
-        "instruction": episode.info.instruction,
-        "outcome": episode.verdict,
-        "seconds": round(episode.duration, 3),
-        "frames": episode.num_frames,
-        "episode": episode.info.episode_index,
-        "source": episode.source,
-    }
-    recording.send_property("episode", rr.AnyValues(**properties))
     return recording
 
 
@@ -188,8 +179,8 @@ def _checks(outcome: Outcome) -> list[str]:
     return ["\n".join(rows)] if outcome.checks else []
 
 
-def save(source: PlaybackSource, target: Path, *, is_alone: bool = True) -> None:
-    """Write an episode and its layout to an .rrd file; a single one needs no list of episodes.
+def save(source: PlaybackSource, target: Path) -> None:
+    """Write an episode and its layout to an .rrd file.
 
     The episode is collected in memory and written here: when the disk is full, Rerun's own file thread only logs the
     error, or blocks forever.
@@ -201,7 +192,7 @@ def save(source: PlaybackSource, target: Path, *, is_alone: bool = True) -> None
     with source.open() as episode:
         recording = new_recording(episode)
         stream = recording.binary_stream()
-        recording.send_blueprint(episode_layout(episode, is_alone=is_alone), make_active=False, make_default=True)
+        recording.send_blueprint(episode_layout(episode), make_active=False, make_default=True)
         try:
             log_episode(recording, episode)
         finally:
@@ -220,7 +211,7 @@ def save_each(sources: Sequence[PlaybackSource], folder: Path) -> list[Path]:
     files = [folder / f"{index:06d}.rrd" for index in range(len(sources))]
     for source, file in zip(sources, files, strict=True):
         try:
-            save(source, file, is_alone=len(sources) == 1)
+            save(source, file)
         except OSError as error:
             raise write_error("The file", error, file, RecordingError) from error
     return files

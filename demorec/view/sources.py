@@ -90,16 +90,15 @@ def open_recorded(path: Path, named: NamedRoles = NO_NAMES) -> Iterator[Playback
     """
     folder = path.resolve().parent
     with Recording(path) as recording:
-        roles, motion = roles_of_recording(recording.info, named), recording.motion()
+        roles = roles_of_recording(recording.info, named)
         has_scene = scene_of(recording.info) is not None
         yield Playback(
             name=path.name.removesuffix(".mcap"),
             group=folder.parent.name if folder.name in (EPISODES, FAILED) else folder.name,
             identity=hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:16],
-            source=path.name,
             data=recording,
-            motion=motion,
+            motion=recording.motion(),
             roles=roles,
-            curves=simulated_curves(recording, motion) if has_scene else feature_curves(recording, roles),
+            curves=simulated_curves(recording) if has_scene else feature_curves(recording, roles),
             statements=tuple((frame, "subtask", text) for frame, text in recording.subtasks),
         )

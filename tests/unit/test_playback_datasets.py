@@ -52,7 +52,7 @@ def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path
         np.testing.assert_allclose(episode.motion.object_poses["red_cube"], recorded, atol=1e-6)
 
 
-def test_depth_is_shown_in_millimetres_as_the_recordings_have_it(tmp_path: Path) -> None:
+def test_depth_is_shown_as_the_recordings_have_it(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (3, 4), depth=True, cameras=("front",))
     export(run, tmp_path / "d", depth=True)
     with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 1) as episode:  # the second in its file
@@ -67,12 +67,12 @@ def test_depth_is_shown_in_millimetres_as_the_recordings_have_it(tmp_path: Path)
     assert len(packets) == 4
     assert (measured == 0).any()  # the sky
     np.testing.assert_array_equal(shown == 0, measured == 0)
-    np.testing.assert_allclose(shown / 1000, measured, atol=2e-3)  # whole millimetres
+    np.testing.assert_allclose(shown, measured, atol=2e-3)
     save(find_episodes([tmp_path / "d"])[1], tmp_path / "x.rrd")
     chunks = [chunk for chunk in RrdReader(tmp_path / "x.rrd").stream() if chunk.entity_path.endswith("front/depth")]
     batches = [chunk.to_record_batch() for chunk in chunks]
     buffers = [row[0] for batch in batches for row in batch.column("DepthImage:buffer").to_pylist()]
-    drawn = np.frombuffer(bytes(buffers[-1]), dtype=np.uint16).reshape(measured[0].shape) / 1000
+    drawn = np.frombuffer(bytes(buffers[-1]), dtype=np.float32).reshape(measured[0].shape)
     np.testing.assert_allclose(drawn, measured[-1], atol=2e-3)
 
 
