@@ -12,6 +12,7 @@ from demorec.core.errors import RenderError
 from demorec.episode.scene import Light
 from demorec.render.raster.batch import caster_geometry
 from demorec.render.raster.kernels import layout
+from demorec.render.raster.kernels.still import restore_samples
 from demorec.render.raster.kernels.triangles import draw_casters
 from demorec.render.raster.kernels.vertices import place_instances, transform_casters
 from demorec.render.raster.mesh import Floats
@@ -75,7 +76,10 @@ class Stage:
         self.heights = np.full((shadow_size, shadow_size), BELOW, dtype=np.float32)
         self.still_heights = self.heights.copy()
         self.touched = np.zeros((tiles, tiles), dtype=np.uint8)
-        self._bounds = np.array([shadow_size, 0, shadow_size, 0], dtype=np.int64)
+        self._ids = np.zeros((shadow_size, shadow_size), dtype=np.int32)
+        # Extents of moving instances in the map.
+        self._left = np.full(shadow_size, shadow_size, dtype=np.int32)
+        self._right = np.zeros(shadow_size, dtype=np.int32)
 
     def _fit_shadow(self) -> tuple[Floats, float]:
         """Compute (3, 4) world to shadow map (texels, texels, metres), and metres per texel.
@@ -129,31 +133,18 @@ class Stage:
             self.shadow_from_shape,
             self.light_in_shape,
         )
-        bounds = self._bounds
         if still_moved:
             self.still_heights.fill(BELOW)
-            self._draw(0, self.num_still, self.still_heights, mark=False)
-            self.heights[:] = self.still_heights
-        elif bounds[1] > bounds[0]:
-            x, y = slice(int(bounds[0]), int(bounds[1])), slice(int(bounds[2]), int(bounds[3]))
-            self.heights[y, x] = self.still_heights[y, x]
+            self._draw(0, self.num_still, self.still_heights)
+            self._left.fill(0)
+            self._right.fill(self.shadow_size)
+        restore_samples(self.heights, self.still_heights, self._ids, self._ids, self._left, self._right)
         self.touched.fill(0)
-        bounds[:] = (self.shadow_size, 0, self.shadow_size, 0)
-        self._draw(self.num_still, len(self.instances), self.heights, mark=True)
+        self._draw(self.num_still, len(self.instances), self.heights)
 
-    def _draw(self, first: int, last: int, heights: NDArray[np.float32], *, mark: bool) -> None:
+    def _draw(self, first: int, last: int, heights: NDArray[np.float32]) -> None:
         transform_casters(first, last, self._casters, self.shadow_from_shape)
-        draw_casters(
-            first,
-            last,
-            self._casters,
-            self.shadow_size,
-            heights.reshape(-1),
-            self.touched,
-            mark,
-            self._bounds,
-            np.zeros(1, dtype=np.int32),
-        )
+        draw_casters(first, last, self._casters, heights, self._ids, self.touched, self._left, self._right)
 
 
 def _light_table(light: Light) -> NDArray[np.float32]:

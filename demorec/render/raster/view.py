@@ -15,9 +15,9 @@ from demorec.render.raster.batch import Batch, Floats32
 from demorec.render.raster.kernels import layout
 from demorec.render.raster.kernels.antialias import STILL, centre_of_mixed, halve_extents, resolve, shade_edges
 from demorec.render.raster.kernels.layout import Images, Looks, Records
-from demorec.render.raster.kernels.records import flag_owners, set_up_records
+from demorec.render.raster.kernels.records import set_up_records
 from demorec.render.raster.kernels.shade import shade_rows
-from demorec.render.raster.kernels.still import clear_queued, gather_still, list_tiles, restore_samples, shade_still
+from demorec.render.raster.kernels.still import clear_queued, restore_samples, shade_still
 from demorec.render.raster.kernels.triangles import draw_instances
 from demorec.render.raster.kernels.vertices import aim_camera, project_instances, transform_vertices
 from demorec.render.raster.mesh import Floats
@@ -41,7 +41,8 @@ class _Still:
         values, ids: Samples.
         pixel_ids: Records of pixels.
         num_records, num_vertices: Number that it uses.
-        tile_start, tile_pixels, gathered: Pixels that read each shadow tile, and their terms.
+        tile_start: (tiles * tiles + 1,) first of the pixels that read each shadow tile.
+        tile_pixels, gathered: Those pixels, y * W + x, and their terms.
     """
 
     key: tuple[bytes, int]
@@ -52,7 +53,7 @@ class _Still:
     num_records: int
     num_vertices: int
     tile_start: NDArray[np.int64]
-    tile_pixels: Int32s
+    tile_pixels: NDArray[np.int64]
     gathered: Floats32
 
 
@@ -206,13 +207,7 @@ class CameraView:
         h, w = self.camera.height, self.camera.width
         terms = np.zeros((h, w, layout.STILL_SIZE), dtype=np.float32)
         images, records, vertices = self._draw(stage.num_still, terms)
-        tiles = stage.touched.shape[0]
-        tile_start = np.zeros(tiles * tiles + 1, dtype=np.int64)
-        tile_pixels = np.zeros(h * w * self.samples**2, dtype=np.int32)
-        list_tiles(terms, self.pixel_ids, self.ids, self.records, tiles, stage.shadow_size, tile_start, tile_pixels)
-        count = int(tile_start[-1])
-        gathered = np.zeros((count + 1, layout.STILL_SIZE), dtype=np.float32)
-        gather_still(terms, tile_pixels, count, gathered)
+        tile_start, tile_pixels = self._list_tiles(terms)
         pixel_ids = self.pixel_ids.copy()
         if self.samples == 2:
             self.pixel_ids.fill(STILL)
@@ -229,9 +224,38 @@ class CameraView:
             num_records=records,
             num_vertices=vertices,
             tile_start=tile_start,
-            tile_pixels=tile_pixels[:count].copy(),
-            gathered=gathered,
+            tile_pixels=tile_pixels,
+            gathered=terms.reshape(-1, layout.STILL_SIZE)[tile_pixels],
         )
+
+    def _list_tiles(self, terms: Floats32) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """List the pixels that read each shadow tile, as in `_Still`; edges are listed for each of their samples.
+
+        Args:
+            terms: (H, W, STILL_SIZE) from shading.
+        """
+        width, records = self.camera.width, self.records
+        whole = np.flatnonzero(self.pixel_ids >= 0)
+        places = terms.reshape(-1, layout.STILL_SIZE)[whole, 6:8]
+        rows, columns = np.nonzero(self.pixel_ids == layout.EDGE)
+        sample_x = 2 * columns[:, None] + np.array([0, 1, 0, 1])
+        sample_y = 2 * rows[:, None] + np.array([0, 0, 1, 1])
+        drawn = self.ids[sample_y, sample_x] >= 0
+        sample_x, sample_y = sample_x[drawn], sample_y[drawn]
+        record = self.ids[sample_y, sample_x]
+        fx, fy = (np.stack([sample_x, sample_y]) - records.origins[record].T).astype(np.float32)
+        planes = records.planes[record].T
+        z = 1 / (planes[0] + planes[2] * fy + planes[1] * fx)
+        x = np.concatenate([places[:, 0], (planes[3] + planes[5] * fy + planes[4] * fx) * z])
+        y = np.concatenate([places[:, 1], (planes[6] + planes[8] * fy + planes[7] * fx) * z])
+        pixels = np.concatenate([whole, sample_y // 2 * width + sample_x // 2])
+        limit = self._stage.shadow_size - 1
+        inside = (x >= 0) & (y >= 0) & (x < limit) & (y < limit)
+        tiles = self._stage.touched.shape[1]
+        tile_x, tile_y = np.stack([x, y])[:, inside].astype(np.int64) >> layout.TILE_SHIFT
+        tile = tile_y * tiles + tile_x
+        order = np.argsort(tile, kind="stable")
+        return np.searchsorted(tile[order], np.arange(tiles**2 + 1)), pixels[inside][order]
 
     def _aim(self, pose: Floats) -> None:
         """Compute the matrices of the camera and of every instance, and the sky's rays."""
@@ -310,14 +334,11 @@ class CameraView:
             still = np.zeros((0, 0, layout.STILL_SIZE), dtype=np.float32)
         else:
             looks = self.still_looks
-        records.flags[first:last] = 0
         counts = 0, 0
         if self.samples == 2:
             counts = resolve(
                 left, right, lowest, self.ids, self.values, records, face_table, self.pixel_ids, self.edges, self._mixed
             )
-        else:
-            flag_owners(left, right, first, self.ids, records.flags)
         set_up_records(first, last, records, face_table, self.geometry.vertices)
         shade_rows(left, right, lowest, self.pixel_ids, self.samples, records, looks, images, still)
         return counts
@@ -345,7 +366,6 @@ def _empty_records(count: int) -> Records:
     return Records(
         corners=np.zeros((count, 3), dtype=np.int32),
         faces=np.zeros(count, dtype=np.int32),
-        flags=np.zeros(count, dtype=np.uint8),
         planes=np.zeros((count, layout.RECORD), dtype=np.float32),
         origins=np.zeros((count, 2), dtype=np.int32),
     )

@@ -36,7 +36,7 @@ def resolve(left, right, first_record, ids, values, records, face_table, pixel_i
         first_record: Records below it are static and already shaded.
         ids, values: (2H, 2W) records and inverse depths of the samples.
         pixel_ids: (H, W) result: record, BACKGROUND, STILL or EDGE.
-        records: Those from `first_record` on that own a sample are flagged.
+        records: The triangles.
         edges: Result: y * W + x of pixels to be shaded sample by sample.
         mixed: Result: y * W + x of all pixels with different samples; of size 0 if not requested.
 
@@ -46,10 +46,8 @@ def resolve(left, right, first_record, ids, values, records, face_table, pixel_i
     width = pixel_ids.shape[1]
     want_mixed = mixed.size > 0
     record_face = records.faces
-    flags = records.flags
     edge_count = 0
     mixed_count = 0
-    lowest = max(first_record, 0)
     for y in range(pixel_ids.shape[0]):
         for x in range(left[y], right[y]):
             a = ids[2 * y, 2 * x]
@@ -58,15 +56,10 @@ def resolve(left, right, first_record, ids, values, records, face_table, pixel_i
             d = ids[2 * y + 1, 2 * x + 1]
             if a == b and a == c and a == d:
                 pixel_ids[y, x] = a if a >= first_record else STILL
-                if a >= lowest:
-                    flags[a] = 1
                 continue
             if max(a, b, c, d) < first_record:
                 pixel_ids[y, x] = STILL
                 continue
-            for record in (a, b, c, d):
-                if record >= lowest:
-                    flags[record] = 1
             if want_mixed:
                 mixed[mixed_count] = y * width + x
                 mixed_count += 1

@@ -66,14 +66,13 @@ def within_edge(step_x, value, low, high):
 
 
 @inlined
-def fill_triangle(a, b, c, v0, v1, v2, area, width, height, values, ids, record, with_ids, left, right):
+def fill_triangle(a, b, c, v0, v1, v2, area, width, height, values, ids, record, left, right):
     """Draw one triangle of positive area where its value exceeds the stored one.
 
     Args:
         a, b, c: Corners, in units of `screen`.
         v0, v1, v2: Value at the corners (inverse depth, height), linear over the image.
         values, ids: (height * width,) greatest stored value, and its record.
-        with_ids: Whether ids, left and right are updated.
         left, right: (height,) extents drawn in each row, widened (to the corners, for narrow triangles).
 
     Returns:
@@ -109,9 +108,8 @@ def fill_triangle(a, b, c, v0, v1, v2, area, width, height, values, ids, record,
         number = i4(record)
         nearer_count = i4(0)
         for row in range(y_first, y_last + 1):
-            if with_ids:
-                left[index(row)] = min(left[index(row)], i4(x_first))
-                right[index(row)] = max(right[index(row)], i4(x_last + 1))
+            left[index(row)] = min(left[index(row)], i4(x_first))
+            right[index(row)] = max(right[index(row)], i4(x_last + 1))
             start = row * width + x_first
             c0 = e0
             c1 = e1
@@ -119,28 +117,18 @@ def fill_triangle(a, b, c, v0, v1, v2, area, width, height, values, ids, record,
             value = f4(row_value)
             for strip in range(strips):
                 base = strip * STRIP
-                if with_ids:
-                    for k in range(STRIP):
-                        q = index(start + base + k)
-                        there = values[q]
-                        id_there = ids[q]
-                        column = i4(base + k)
-                        here = value + value_step * f4(column)
-                        j = f8(i4(k))
-                        inside = (c0 + a0 * j >= 0.0) & (c1 + a1 * j >= 0.0) & (c2 + a2 * j >= 0.0) & (column <= limit)
-                        nearer = inside & (here > there)
-                        values[q] = here if nearer else there
-                        ids[q] = number if nearer else id_there
-                        nearer_count += i4(nearer)
-                else:
-                    for k in range(STRIP):
-                        q = index(start + base + k)
-                        there = values[q]
-                        column = i4(base + k)
-                        here = value + value_step * f4(column)
-                        j = f8(i4(k))
-                        inside = (c0 + a0 * j >= 0.0) & (c1 + a1 * j >= 0.0) & (c2 + a2 * j >= 0.0) & (column <= limit)
-                        values[q] = here if inside & (here > there) else there
+                for k in range(STRIP):
+                    q = index(start + base + k)
+                    there = values[q]
+                    id_there = ids[q]
+                    column = i4(base + k)
+                    here = value + value_step * f4(column)
+                    j = f8(i4(k))
+                    inside = (c0 + a0 * j >= 0.0) & (c1 + a1 * j >= 0.0) & (c2 + a2 * j >= 0.0) & (column <= limit)
+                    nearer = inside & (here > there)
+                    values[q] = here if nearer else there
+                    ids[q] = number if nearer else id_there
+                    nearer_count += i4(nearer)
                 c0 += a0 * f8(STRIP)
                 c1 += a1 * f8(STRIP)
                 c2 += a2 * f8(STRIP)
@@ -161,24 +149,17 @@ def fill_triangle(a, b, c, v0, v1, v2, area, width, height, values, ids, record,
                 hit = True
                 value = f4(row_value)
                 start = row * width + x_first + first
-                if with_ids:
-                    left[index(row)] = min(left[index(row)], i4(x_first + first))
-                    right[index(row)] = max(right[index(row)], i4(x_first + last + 1))
-                    number = i4(record)
-                    for k in range(last - first + 1):
-                        q = index(start + k)
-                        here = value + value_step * f4(i4(first + k))
-                        there = values[q]
-                        nearer = here > there
-                        id_there = ids[q]
-                        values[q] = here if nearer else there
-                        ids[q] = number if nearer else id_there
-                else:
-                    for k in range(last - first + 1):
-                        q = index(start + k)
-                        here = value + value_step * f4(i4(first + k))
-                        there = values[q]
-                        values[q] = here if here > there else there
+                left[index(row)] = min(left[index(row)], i4(x_first + first))
+                right[index(row)] = max(right[index(row)], i4(x_first + last + 1))
+                number = i4(record)
+                for k in range(last - first + 1):
+                    q = index(start + k)
+                    here = value + value_step * f4(i4(first + k))
+                    there = values[q]
+                    nearer = here > there
+                    id_there = ids[q]
+                    values[q] = here if nearer else there
+                    ids[q] = number if nearer else id_there
         e0 += b0
         e1 += b1
         e2 += b2

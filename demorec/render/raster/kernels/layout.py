@@ -106,14 +106,12 @@ class Records(NamedTuple):
     Attributes:
         corners: (r, 3) vertex addresses.
         faces: (r,) face that the triangle is, or is a part of.
-        flags: (r,) 1 if it owns a sample, so that its planes are needed.
         planes: (r, RECORD).
         origins: (r, 2) samples at the planes' origins.
     """
 
     corners: NDArray[np.int32]
     faces: NDArray[np.int32]
-    flags: NDArray[np.uint8]
     planes: NDArray[np.float32]
     origins: NDArray[np.int32]
 

@@ -1,5 +1,5 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
-"""Triangles that own samples, and the image planes of their attributes for shading."""
+"""The image planes of the triangles' attributes, for shading."""
 
 from __future__ import annotations
 
@@ -8,20 +8,6 @@ from demorec.render.raster.kernels.fill import doubled_area, screen
 from demorec.render.raster.kernels.jit import f4, f8, index, inlined, kernel
 
 LANES, IW, TEX_U, TEX_V = at.LANES, at.INVERSE_W, at.TEX_U, at.TEX_V
-
-
-@kernel
-def flag_owners(left, right, first_record, ids, flags):
-    """Set the flag of every record from `first_record` on that owns a sample of (rows, columns) `ids`."""
-    before = -9
-    lowest = max(first_record, 0)
-    for y in range(ids.shape[0]):
-        for x in range(left[y], right[y]):
-            record = ids[y, x]
-            if record != before:
-                before = record
-                if record >= lowest:
-                    flags[record] = 1
 
 
 @inlined
@@ -39,11 +25,9 @@ def set_planes(planes, record, column, vertices, attribute, count, corners, valu
 
 @kernel
 def set_up_records(first, last, records, face_table, vertices):
-    """Fill the planes and origins of the flagged records `first` .. `last` - 1."""
+    """Fill the planes and origins of the records `first` .. `last` - 1."""
     planes = records.planes
     for t in range(first, last):
-        if records.flags[t] == 0:
-            continue
         a = index(records.corners[t, 0])
         b = index(records.corners[t, 1])
         c = index(records.corners[t, 2])

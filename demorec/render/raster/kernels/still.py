@@ -9,8 +9,7 @@ from demorec.render.raster.kernels import layout as at
 from demorec.render.raster.kernels.jit import f4, i4, index, kernel
 from demorec.render.raster.kernels.lookups import shadow_at, tone
 
-EDGE, QUEUED, BACKGROUND = at.EDGE, at.QUEUED, at.BACKGROUND
-SHIFT = at.TILE_SHIFT
+EDGE, QUEUED = at.EDGE, at.QUEUED
 
 
 @kernel
@@ -30,68 +29,6 @@ def restore_samples(values, still_values, ids, still_ids, left, right):
             ids[index(start + j)] = still_ids[index(start + j)]
         left[y] = width
         right[y] = 0
-
-
-@kernel
-def list_tiles(still, pixel_ids, ids, triangles, tiles, size, tile_start, tile_pixels):
-    """List for each shadow map tile the pixels that read it: a pixel y * W + x per lookup.
-
-    Args:
-        still: (H, W, STILL_SIZE) from shading; pixel_ids, ids: records of pixels and of samples.
-        tile_start: (tiles * tiles + 1,) result, start of each tile's pixels.
-        tile_pixels: Result, with room for four lookups per pixel.
-    """
-    height, width = pixel_ids.shape
-    records = triangles.planes
-    origins = triangles.origins
-    limit = f4(size - 1)
-    tile_start[:] = 0
-    for fill in range(2):
-        for y in range(height):
-            for x in range(width):
-                edge = pixel_ids[y, x] == EDGE
-                if pixel_ids[y, x] == BACKGROUND:
-                    continue
-                for s in range(4 if edge else 1):
-                    if edge:
-                        sample_x = 2 * x + (s & 1)
-                        sample_y = 2 * y + (s >> 1)
-                        record = ids[sample_y, sample_x]
-                        if record < 0:
-                            continue
-                        fx = f4(sample_x - origins[record, 0])
-                        fy = f4(sample_y - origins[record, 1])
-                        p = records[record]
-                        z = f4(1) / (p[0] + p[2] * fy + p[1] * fx)
-                        place_x = (p[3] + p[5] * fy + p[4] * fx) * z
-                        place_y = (p[6] + p[8] * fy + p[7] * fx) * z
-                    else:
-                        place_x = still[y, x, 6]
-                        place_y = still[y, x, 7]
-                    if place_x >= f4(0) and place_y >= f4(0) and place_x < limit and place_y < limit:
-                        tile = (int(place_y) >> SHIFT) * tiles + (int(place_x) >> SHIFT)
-                        if fill == 0:
-                            tile_start[tile + 1] += 1
-                        else:
-                            tile_pixels[tile_start[tile]] = y * width + x
-                            tile_start[tile] += 1
-        if fill == 0:
-            for i in range(tiles * tiles):
-                tile_start[i + 1] += tile_start[i]
-    for i in range(tiles * tiles, 0, -1):
-        tile_start[i] = tile_start[i - 1]
-    tile_start[0] = 0
-
-
-@kernel
-def gather_still(still, tile_pixels, count, gathered):
-    """Copy the pixels' terms into the order of the tiles, (count, STILL_SIZE)."""
-    width = still.shape[1]
-    for i in range(count):
-        y = tile_pixels[i] // width
-        x = tile_pixels[i] - y * width
-        for j in range(at.STILL_SIZE):
-            gathered[i, j] = still[y, x, j]
 
 
 @kernel

@@ -68,7 +68,6 @@ def draw_instances(first, last, record, next_vertex, geometry, visible, values, 
     Returns:
         The next free record and vertex; a record of -1 if the room for clipped vertices or records is used up.
     """
-    with_ids = np.bool_(True)  # not a literal, which would compile all inlined code once more
     height, width = ids.shape
     values = values.reshape(-1)
     ids = ids.reshape(-1)
@@ -93,12 +92,9 @@ def draw_instances(first, last, record, next_vertex, geometry, visible, values, 
             wc = vertices[c + index(CW)]
             if record >= record_limit:
                 return -1, next_vertex
-            if min(wa, wb, wc) > near:
-                pa = screen(vertices, a)
-                pb = screen(vertices, b)
-                pc = screen(vertices, c)
-                area = doubled_area(pa, pc, pb)
-                if area <= 0.0:
+            is_clipped = min(wa, wb, wc) <= near
+            if not is_clipped:
+                if doubled_area(screen(vertices, a), screen(vertices, c), screen(vertices, b)) <= 0.0:
                     continue
                 cx = max(
                     abs(vertices[a + index(CX)]) - guard * wa,
@@ -110,36 +106,17 @@ def draw_instances(first, last, record, next_vertex, geometry, visible, values, 
                     abs(vertices[b + index(CY)]) - guard * wb,
                     abs(vertices[c + index(CY)]) - guard * wc,
                 )
-                if cx < f4(0) and cy < f4(0):
-                    va = f8(vertices[a + index(IW)])
-                    vb = f8(vertices[b + index(IW)])
-                    vc = f8(vertices[c + index(IW)])
-                    if fill_triangle(
-                        pa, pc, pb, va, vc, vb, area, width, height, values, ids, record, with_ids, left, right
-                    ):
-                        note_record(records, record, a, c, b, f)
-                        record += 1
-                    continue
-            if max(wa, wb, wc) <= near:
+                is_clipped = cx >= f4(0) or cy >= f4(0)
+            elif max(wa, wb, wc) <= near:
                 continue
-            xa = vertices[a + index(CX)]
-            xb = vertices[b + index(CX)]
-            xc = vertices[c + index(CX)]
-            ya = vertices[a + index(CY)]
-            yb = vertices[b + index(CY)]
-            yc = vertices[c + index(CY)]
-            if (xa > wa and xb > wb and xc > wc) or (-xa > wa and -xb > wb and -xc > wc):
-                continue
-            if (ya > wa and yb > wb and yc > wc) or (-ya > wa and -yb > wb and -yc > wc):
-                continue
-            if next_vertex + 12 > vertex_limit:
+            if is_clipped and next_vertex + 12 > vertex_limit:
                 return -1, next_vertex
-            # Sutherland-Hodgman against the near plane and the four guard planes.
             inside[0] = a
             inside[1] = c
             inside[2] = b
             corners = 3
-            for plane in range(5):
+            # Sutherland-Hodgman against the near plane and the four guard planes.
+            for plane in range(5 if is_clipped else 0):
                 kept = 0
                 for q in range(corners):
                     u = inside[q]
@@ -177,29 +154,27 @@ def draw_instances(first, last, record, next_vertex, geometry, visible, values, 
                 vu = f8(vertices[u + index(IW)])
                 vv = f8(vertices[v + index(IW)])
                 vw = f8(vertices[w + index(IW)])
-                if fill_triangle(
-                    pu, pv, pw, vu, vv, vw, area, width, height, values, ids, record, with_ids, left, right
-                ):
+                if fill_triangle(pu, pv, pw, vu, vv, vw, area, width, height, values, ids, record, left, right):
                     note_record(records, record, u, v, w, f)
                     record += 1
     return record, next_vertex
 
 
 @kernel
-def draw_casters(first, last, geometry, size, heights, touched, mark, bounds, nothing):
+def draw_casters(first, last, geometry, heights, ids, touched, left, right):
     """Draw the faces of instances `first` .. `last` - 1 into the shadow map, both sides of each.
 
     Back faces are drawn too: a decimated mesh leaves gaps at its silhouette, and culling would let light through.
 
     Args:
-        size: Texels along a side.
-        heights: (size * size,) greatest height towards the light.
-        touched: (tiles, tiles) uint8, set where a lookup may read the drawn texels (with `mark`).
-        bounds: (4,) first and last x, first and last y drawn, widened (with `mark`).
-        nothing: An empty int32 array that replaces record numbers and extents.
+        heights: (size, size) greatest height towards the light.
+        ids: (size, size) int32, of no use here.
+        touched: (tiles, tiles) uint8, set where a lookup may read the drawn texels.
+        left, right: (size,) extents drawn.
     """
-    record = np.int64(0)  # not literals, see draw_instances
-    with_ids = np.bool_(False)
+    size = heights.shape[0]
+    heights = heights.reshape(-1)
+    ids = ids.reshape(-1)
     vertices = geometry.vertices
     for k in range(first, last):
         for f in range(geometry.face_start[k], geometry.face_end[k]):
@@ -219,19 +194,12 @@ def draw_casters(first, last, geometry, size, heights, touched, mark, bounds, no
                 area = -area
                 pb, pc = pc, pb
                 vb, vc = vc, vb
-            if mark:
-                y_first, y_last = covered(min(pa[1], pb[1], pc[1]), max(pa[1], pb[1], pc[1]), size)
-                x_first, x_last = covered(min(pa[0], pb[0], pc[0]), max(pa[0], pb[0], pc[0]), size)
-                if y_first > y_last or x_first > x_last:
-                    continue
-                bounds[0] = min(bounds[0], x_first)
-                bounds[1] = max(bounds[1], x_last + 1)
-                bounds[2] = min(bounds[2], y_first)
-                bounds[3] = max(bounds[3], y_last + 1)
-                # A lookup at (x, y) reads the texels x - 1 .. x + 2.
-                for tile_y in range(max(0, y_first - 2) >> SHIFT, (min(size - 1, y_last + 1) >> SHIFT) + 1):
-                    for tile_x in range(max(0, x_first - 2) >> SHIFT, (min(size - 1, x_last + 1) >> SHIFT) + 1):
-                        touched[tile_y, tile_x] = 1
-            fill_triangle(
-                pa, pb, pc, va, vb, vc, area, size, size, heights, nothing, record, with_ids, nothing, nothing
-            )
+            y_first, y_last = covered(min(pa[1], pb[1], pc[1]), max(pa[1], pb[1], pc[1]), size)
+            x_first, x_last = covered(min(pa[0], pb[0], pc[0]), max(pa[0], pb[0], pc[0]), size)
+            if y_first > y_last or x_first > x_last:
+                continue
+            # A lookup at (x, y) reads the texels x - 1 .. x + 2.
+            for tile_y in range(max(0, y_first - 2) >> SHIFT, (min(size - 1, y_last + 1) >> SHIFT) + 1):
+                for tile_x in range(max(0, x_first - 2) >> SHIFT, (min(size - 1, x_last + 1) >> SHIFT) + 1):
+                    touched[tile_y, tile_x] = 1
+            fill_triangle(pa, pb, pc, va, vb, vc, area, size, size, heights, ids, np.int64(0), left, right)
