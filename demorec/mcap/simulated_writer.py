@@ -48,8 +48,9 @@ class EpisodeWriter(BatchWriter):
         """Add the next frame with its images.
 
         Raises:
-            RecordingError: Frames are out of order; vectors, objects or cameras are missing, unknown or of a wrong
-                length; numbers are not finite; images are missing or have a wrong size; or the disk is full.
+            RecordingError: Frames are out of order; vectors have a wrong length; numbers are not finite; images are
+                missing or have a wrong size; or the disk is full.
+            KeyError: Objects, sensors or cameras are missing.
         """
         due = (self.num_frames, frame_time_ns(self.num_frames, self._info.fps))
         if (frame.frame_index, frame.time_ns) != due:
@@ -57,7 +58,6 @@ class EpisodeWriter(BatchWriter):
                 f"Frame {frame.frame_index} at {frame.time_ns} ns arrived instead of frame {due[0]} at {due[1]} ns: "
                 "write frames in order, each once."
             )
-        self._check_names(frame)
         if not self._is_described:
             self._open_cameras(frame.images)
         for name, writer in self._cameras.items():
@@ -75,19 +75,6 @@ class EpisodeWriter(BatchWriter):
         """See `BatchWriter`."""
         if frames := self._write_frames():
             self._write_images({name: number + 1 for name, number in frames[-1].images.items()})
-
-    def _check_names(self, frame: Frame) -> None:
-        seen, info = frame.observation, self._info
-        for what, found, known in (
-            ("poses of the objects", seen.object_poses, self._objects),
-            ("images of the cameras", frame.images, [camera.name for camera in info.cameras]),
-            ("numbers of the sensors", seen.sensed, list(info.sensors)),
-        ):
-            if found.keys() != set(known):
-                raise RecordingError(
-                    f"Frame {frame.frame_index} has {what} {', '.join(sorted(found)) or 'none'}, the scene has "
-                    f"{', '.join(sorted(known)) or 'none'}."
-                )
 
     def _open_cameras(self, first: Mapping[str, CameraImages]) -> None:
         for camera in self._info.cameras:

@@ -168,10 +168,10 @@ class _StreamEncoder:
         frame = av.VideoFrame.from_ndarray(image, format="rgb24")
         frame.pts, frame.time_base = self._num_images, self._time_base
         self._num_images += 1
-        return _bare(self._context.encode(frame))
+        return [bytes(packet) for packet in self._context.encode(frame)]
 
     def finish(self) -> list[bytes]:
-        return _bare(self._context.encode(None))
+        return [bytes(packet) for packet in self._context.encode(None)]
 
 
 Encoder = _JpegEncoder | _StreamEncoder
@@ -181,15 +181,6 @@ Encoder = _JpegEncoder | _StreamEncoder
 def make_encoder(video: VideoConfig, width: int, height: int, fps: int) -> Encoder:
     """Make an encoder as configured; RecordingError if this build of FFmpeg lacks the codec."""
     return (_JpegEncoder if video.codec == "jpeg" else _StreamEncoder)(video, width, height, fps)
-
-
-def _bare(packets: Iterable[av.Packet]) -> list[bytes]:
-    result = []
-    for packet in packets:
-        if packet.dts != packet.pts:
-            raise RecordingError(f"The video encoder reordered its images (pts {packet.pts}, dts {packet.dts}).")
-        result.append(bytes(packet))
-    return result
 
 
 def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:

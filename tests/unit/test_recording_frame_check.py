@@ -12,7 +12,6 @@ import pytest
 from support.recording import make_episode
 
 from demorec.core.errors import RecordingError
-from demorec.core.geometry import Pose
 from demorec.episode.episode import Frame
 from demorec.mcap import EpisodeWriter
 
@@ -33,18 +32,6 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     "seven joints for nine": (
         lambda f: observed(f, joint_position=f.observation.joint_position[:7]),
         "25 numbers for /joint_states, it must have 27",
-    ),
-    "an unknown object": (
-        lambda f: observed(f, object_poses={**f.observation.object_poses, "ball": Pose()}),
-        "poses of the objects ball, cube, the scene has cube",
-    ),
-    "an unknown camera": (
-        lambda f: replace(f, images={**f.images, "top": f.images["front"]}),
-        "images of the cameras front, top, the scene has front",
-    ),
-    "no wrench": (
-        lambda f: observed(f, sensed={}),
-        "numbers of the sensors none, the scene has wrench",
     ),
     "a NaN in a command": (
         lambda f: moved(f, joint_target=with_nan(f.command.joint_target)),
