@@ -9,19 +9,17 @@ from __future__ import annotations
 
 import os
 import struct
-import zlib
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from io import BytesIO
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, McapRecord, Metadata, Schema
+from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.stream_reader import get_chunk_data_stream
 from numpy.typing import NDArray
 
 RECORD_HEAD = struct.Struct("<BQ")
@@ -40,7 +38,6 @@ _MESSAGE_HEAD = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-_CHUNK_HEAD = struct.Struct("<QQQII")
 _IN_CHUNKS = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
 _GATHERED_ROWS = 4096
 """Messages copied from a chunk at once: the indices of their bytes take eight times as much memory as the bytes."""
@@ -76,19 +73,6 @@ def read_record[R: McapRecord](content: bytes | memoryview, kind: type[R]) -> R:
     return record
 
 
-# These bytes are the same in every recording of a run, and an export opens many.
-@lru_cache(maxsize=1024)
-def read_channel(content: bytes) -> Channel:
-    """Parse a Channel record."""
-    return read_record(content, Channel)
-
-
-@lru_cache(maxsize=256)
-def read_schema(content: bytes) -> Schema:
-    """Parse a Schema record."""
-    return read_record(content, Schema)
-
-
 def scan(file: BinaryIO) -> Iterator[ScannedMessage | Metadata | None]:
     """Yield the messages and metadata of a file, open at its first record, in order, and None at the end of each chunk.
 
@@ -105,10 +89,10 @@ def scan(file: BinaryIO) -> Iterator[ScannedMessage | Metadata | None]:
         elif opcode == Opcode.METADATA:
             yield read_record(data[start:end], Metadata)
         elif opcode == Opcode.SCHEMA:
-            schema = read_schema(data[start:end])
+            schema = read_record(data[start:end], Schema)
             schemas[schema.id] = schema
         else:
-            found = read_channel(data[start:end])
+            found = read_record(data[start:end], Channel)
             schema = schemas[found.schema_id]
             channels[found.id] = ScannedChannel(
                 topic=found.topic,
@@ -134,7 +118,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[int, bytes, int, int]]:
             return
         if opcode == Opcode.CHUNK:
             content = chunk_content(file.read(length))
-            for inner, start, end in records_in(content):
+            for inner, start, end in _records_in(content):
                 if inner in _IN_CHUNKS:
                     yield inner, content, start, end
             yield opcode, b"", 0, 0
@@ -144,7 +128,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[int, bytes, int, int]]:
             file.seek(length, os.SEEK_CUR)
 
 
-def records_in(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, int, int]]:
+def _records_in(content: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield (opcode, start, end) of the records' contents; ValueError or struct.error unless they fill the bytes."""
     position, end = 0, len(content)
     while position < end:
@@ -152,46 +136,20 @@ def records_in(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, 
         start = position + RECORD_HEAD.size
         position = start + length
         if position > end:
-            raise ValueError(f"a record that extends beyond {where}")
+            raise ValueError("a record that extends beyond its chunk")
         yield opcode, start, position
 
 
 def chunk_content(record: bytes | memoryview, expected_size: int | None = None) -> bytes:
     """Unpack a chunk's records from the content of its record; a checksum of 0 means none.
 
-    ValueError, struct.error or zstandard.ZstdError if it is damaged, or has an unexpected size.
+    Any exception of mcap, zstandard or lz4, or ValueError, if it is damaged or has an unexpected size.
     """
-    _, _, size, stored_crc, name_bytes = _CHUNK_HEAD.unpack_from(record)
-    position = _CHUNK_HEAD.size
-    compression = bytes(record[position : position + name_bytes])
-    (num_bytes,) = struct.unpack_from("<Q", record, position + name_bytes)
-    start = position + name_bytes + 8
-    if expected_size is not None and size != expected_size:
-        raise ValueError("a chunk differs from its index")
-    if start + num_bytes > len(record):
-        raise ValueError("a truncated chunk")
-    content = _unpacked(compression, memoryview(record)[start : start + num_bytes], size)
-    if len(content) != size or (stored_crc and zlib.crc32(content) != stored_crc):
-        raise ValueError("a chunk fails its checksum")
-    return content
-
-
-def _unpacked(compression: bytes, stored: memoryview, size: int) -> bytes:
-    if compression == b"":
-        return bytes(stored)
-    if compression == b"zstd":
-        # If the compressed data state their size, zstandard allocates that much, regardless of the limit given here.
-        if zstandard.frame_content_size(stored) not in (size, -1):
-            raise ValueError("a chunk with a different size from its compressed data")
-        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
-    if compression == b"lz4":  # not used here, but by writers of third-party bags
-        import lz4.frame
-
-        try:
-            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size))
-        except RuntimeError as error:  # the only error of lz4
-            raise ValueError("a chunk that lz4 cannot unpack") from error
-    raise ValueError(f"a chunk compressed with {compression!r}, not zstd or lz4")
+    chunk = read_record(record, Chunk)
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    if size != chunk.uncompressed_size or expected_size not in (None, size):
+        raise ValueError("a chunk has another size than stated")
+    return stream.read(size)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -236,11 +194,15 @@ class Block:
 
 
 def blocks_of(contents: Iterable[bytes], topics: Mapping[str, int]) -> dict[str, Block]:
-    """Collect topic -> its messages from the contents of chunks, given topic -> channel; errors as in `records_in`."""
+    """Collect topic -> its messages from the contents of chunks, given topic -> channel.
+
+    ValueError or struct.error unless records fill the chunks.
+    """
     found = array("q")
     joined = BytesIO()
     for chunk in contents:
-        _find_records(chunk, joined.tell(), found.append)
+        offset = joined.tell() - RECORD_HEAD.size
+        found.extend([offset + start for _, start, _ in _records_in(chunk)])
         joined.write(chunk)
     content = joined.getvalue()
     values = np.frombuffer(content, dtype=np.uint8)
@@ -268,14 +230,3 @@ def _gathered(values: NDArray[np.uint8], starts: NDArray[np.int64], length: int)
         part = slice(first, first + _GATHERED_ROWS)
         rows[part] = values[starts[part, np.newaxis] + places]
     return rows
-
-
-def _find_records(content: bytes, offset: int, found: Callable[[int], None]) -> None:
-    """Report the offset of each record of a chunk, counted from `offset`."""
-    unpack, head_bytes = RECORD_HEAD.unpack_from, RECORD_HEAD.size
-    position, end = 0, len(content)
-    while position < end:
-        found(offset + position)
-        position += unpack(content, position)[1] + head_bytes
-    if position != end:
-        raise ValueError("a record that extends beyond its chunk")
