@@ -14,7 +14,7 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -112,15 +112,6 @@ class Layout:
     time_slots: NDArray[np.intp]  # (S,) offsets of the timestamps, which are all set to the message's time
     value_slots: NDArray[np.intp]  # (K,) offsets of the values, of eight bytes each like the timestamps
 
-    @cached_property
-    def _value_runs(self) -> list[tuple[int, int]]:
-        """List (first, last + 1) of the byte runs that are filled by values without a gap."""
-        runs: list[tuple[int, int]] = []
-        for slot in self.value_slots.tolist():
-            first = runs.pop()[0] if runs and runs[-1][1] == slot else slot
-            runs.append((first, slot + 8))
-        return runs
-
     def encode(self, time_ns: NDArray[np.int64], values: NDArray[Any]) -> list[bytes]:
         """Encode one message per row of `values` (N, K), stamped with `time_ns` (N,)."""
         count, length = len(time_ns), len(self.constant)
@@ -138,16 +129,11 @@ class Layout:
 
     def decode(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
         """Decode (N, K) values of messages (N, L); ValueError unless each matches this layout's constant bytes."""
-        values = np.empty((len(rows), len(self.value_slots)), dtype=self.dtype)
+        places = self.value_slots[:, None] + np.arange(8)
+        values = rows.take(places, axis=1).view(self.dtype)[..., 0]
         rest = rows.copy()
-        column = 0
-        for first, last in self._value_runs:
-            count = (last - first) // 8
-            values[:, column : column + count] = np.ascontiguousarray(rows[:, first:last]).view(self.dtype)
-            rest[:, first:last] = 0
-            column += count
-        for slot in self.time_slots.tolist():
-            rest[:, slot : slot + 8] = 0
+        rest[:, places] = 0
+        rest[:, self.time_slots[:, None] + np.arange(8)] = 0
         # The slots of the constant are zero, so the remainder must equal the constant.
         if not (rest == self.constant).all():
             raise ValueError("a message with other names or lengths than the episode's metadata")
