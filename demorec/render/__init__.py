@@ -17,7 +17,7 @@ from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import CameraImages
 from demorec.episode.scene import Light, Rgba, SceneCamera, Texture
 
-VisualKind = Literal["box", "sphere", "cylinder", "capsule", "mesh", "plane"]
+VisualKind = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,7 @@ class Visual:
         link: Number of the link that carries it; the body's base is -1.
         kind: Geometry; decides the meaning of `size`.
         size: box: (x, y, z) full extents, metres; sphere: (radius,); cylinder and capsule: (radius, length) along z;
-            mesh: (x, y, z) scale factors of the file; infinite plane at z = 0: ().
+            mesh: (x, y, z) scale factors of the file.
         file: mesh: path of an OBJ, STL or COLLADA file; otherwise "".
         link_from_shape: Pose in the link frame of `Renderer.render`.
         rgba: Colour, 0..1; alpha 0 is invisible.

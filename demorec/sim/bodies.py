@@ -250,12 +250,11 @@ def _visual(client: Any, row: tuple[Any, ...], name: str, inertial_from_base: Po
         client.GEOM_SPHERE: ("sphere", dimensions[:1]),
         client.GEOM_CYLINDER: ("cylinder", (dimensions[1], dimensions[0])),
         client.GEOM_CAPSULE: ("capsule", (dimensions[1], dimensions[0])),
-        client.GEOM_PLANE: ("plane", ()),
     }
     if kind not in known:
         raise RenderError(
             f"Body {body} ({name!r}), link {link}: PyBullet's visual shape of kind {kind} cannot be drawn: "
-            "use a mesh, box, sphere, cylinder, capsule or plane."
+            "use a mesh, box, sphere, cylinder or capsule."
         )
     kind_name, size = known[kind]
     link_from_shape = Pose(position=np.array(position), quat_xyzw=np.array(quat))

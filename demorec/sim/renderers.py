@@ -75,8 +75,6 @@ class TinyRenderer(Closing):
         for number, (body, row) in enumerate(zip(setup.bodies, first_rows(setup.bodies), strict=True)):
             texture = None if body.texture is None else _load_texture(self._client, body.texture)
             for visual in body.visuals:
-                if visual.kind == "plane":
-                    continue  # PyBullet draws no plane that is created this way
                 try:
                     index = _add(self._client, visual, texture)
                 except Exception as error:  # PyBullet raises its own bare pybullet.error

@@ -63,7 +63,6 @@ def add(client: Any, kind: str, size: tuple[float, ...], pose: Pose | None = Non
         "sphere": lambda: {"shapeType": pybullet.GEOM_SPHERE, "radius": size[0]},
         "cylinder": lambda: {"shapeType": pybullet.GEOM_CYLINDER, "radius": size[0], "length": size[1]},
         "capsule": lambda: {"shapeType": pybullet.GEOM_CAPSULE, "radius": size[0], "length": size[1]},
-        "plane": lambda: {"shapeType": pybullet.GEOM_PLANE, "planeNormal": [0, 0, 1]},
         "mesh": lambda: {"shapeType": pybullet.GEOM_MESH, "meshScale": list(size)},
     }[kind]()
     shape = client.createVisualShape(**(geometry | {"rgbaColor": [0.8, 0.3, 0.2, 1.0]} | visual))

@@ -1,4 +1,4 @@
-"""Meshes of the shapes that PyBullet describes by numbers: boxes, spheres, cylinders, capsules, planes."""
+"""Meshes of the shapes that PyBullet describes by numbers: boxes, spheres, cylinders, capsules."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ SEGMENTS = 64
 """Segments around a circle: the outline of a cylinder of 10 cm radius deviates by less than 0.1 mm."""
 COARSE_SEGMENTS = 24
 """Segments around a circle in the shadow map."""
-PLANE_EXTENT = 100.0
-"""Half the side of the square that represents an infinite plane, metres."""
 
 
 def box(*size: float) -> RasterMesh:
@@ -108,13 +106,3 @@ def capsule(radius: float, length: float, segments: int = SEGMENTS) -> RasterMes
     height = profile[:, 1]
     along = (height - height[0]) / (height[-1] - height[0])
     return revolve(profile, np.concatenate([bottom, top]), along, segments)
-
-
-def plane() -> RasterMesh:
-    """Make a large square in the xy plane that faces up, in cells of 2 m, with the texture once per metre."""
-    edge = np.arange(-PLANE_EXTENT, PLANE_EXTENT + 1, 20.0)
-    n = len(edge)
-    x, y = (a.reshape(-1) for a in np.meshgrid(edge, edge, indexing="ij"))
-    points = np.stack([x, y, np.zeros(n * n)], 1)
-    faces = _grid_faces(n, n)
-    return make_mesh(points, faces, uv=points[faces][:, :, :2])

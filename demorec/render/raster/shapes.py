@@ -97,7 +97,6 @@ class Model:
     texture: Path | None
     coarse: RasterMesh | None = None
     _pieces: dict[Any, Piece] = field(default_factory=dict)
-    _spheres: dict[bytes, tuple[Floats, float]] = field(default_factory=dict)
 
     def piece(self, target: int | None, *, textured: bool) -> Piece:
         """Return the mesh with about `target` faces (None: all), prepared for drawing; computed once."""
@@ -119,12 +118,9 @@ class Model:
 
     def bounding_sphere(self, scale: Floats) -> tuple[Floats, float]:
         """Compute centre (3,) and radius of a sphere around the scaled mesh."""
-        place = scale.tobytes()
-        if place not in self._spheres:
-            points = self.points * scale
-            centre = (points.min(0) + points.max(0)) / 2
-            self._spheres[place] = centre, float(np.sqrt(((points - centre) ** 2).sum(1).max()))
-        return self._spheres[place]
+        points = self.points * scale
+        centre = (points.min(0) + points.max(0)) / 2
+        return centre, float(np.sqrt(((points - centre) ** 2).sum(1).max()))
 
 
 def _model_of(mesh: RasterMesh, *, key: str, read: Callable[[], RasterMesh], coarse: RasterMesh | None = None) -> Model:
@@ -207,12 +203,12 @@ class ModelStore:
         return mesh if colors is None else replace(mesh, colors=colors, texture=None), key
 
     def primitive(self, name: str, *size: float) -> Model:
-        """Make a box (x, y, z), sphere (radius), cylinder or capsule (radius, length), or plane ()."""
+        """Make a box (x, y, z), sphere (radius), cylinder or capsule (radius, length)."""
         place = (name, *size)
         if place not in self._models:
             make: Any = getattr(primitives, name)
             mesh = coarse = make(*size)
-            if name not in ("box", "plane"):  # no curved surface
+            if name != "box":  # a box has no curved surface
                 coarse = make(*size, segments=primitives.COARSE_SEGMENTS)
             self._models[place] = _model_of(mesh, key=repr(place), read=lambda: mesh, coarse=coarse)
         return self._models[place]
@@ -288,8 +284,6 @@ def _model(visual: Visual, store: ModelStore) -> tuple[Model, Floats]:
             return store.primitive("cylinder", 1.0, 1.0), np.array([size[0], size[0], size[1]])
         case "capsule":
             return store.primitive("capsule", size[0], size[1]), one
-        case "plane":
-            return store.primitive("plane"), one
 
 
 def _texture(model: Model, texture: Texture | None, store: ModelStore) -> Pixels | None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections import OrderedDict
 from pathlib import Path
 
 import numpy as np
@@ -29,29 +29,16 @@ def load_image(path: Path) -> Pixels:
         raise RenderError(f"The texture cannot be read ({describe_error(error)}): {path}") from error
 
 
-_pyramids: OrderedDict[int, tuple[Pixels, list[NDArray[np.uint32]], int]] = OrderedDict()
-KEPT_PYRAMIDS = 32
-
-
-def pyramid(image: Pixels) -> tuple[list[NDArray[np.uint32]], int]:
-    """Return `make_pyramid` of an image; recent ones are cached, since most scenes share them."""
-    found = _pyramids.pop(id(image), None)
-    if found is None:
-        found = (image, *make_pyramid(image))  # keeps the image alive, so that its id stays unique
-    _pyramids[id(image)] = found
-    if len(_pyramids) > KEPT_PYRAMIDS:
-        _pyramids.popitem(last=False)
-    return found[1], found[2]
-
-
-def make_pyramid(pixels: Pixels) -> tuple[list[NDArray[np.uint32]], int]:
-    """Compute packed texels of each level, from the largest, and log2 of the largest level's side.
+@functools.lru_cache(maxsize=32)
+def pyramid(shape: tuple[int, ...], pixels: bytes) -> tuple[list[NDArray[np.uint32]], int]:
+    """Compute an image's packed texels of each level, from the largest, and log2 of the largest level's side.
 
     Each level is square with a power of two as side, and repeats its first row and column at the end, so that a
     bilinear lookup needs no second wrap.
     """
-    side = min(LARGEST_SIDE, 1 << max(0, math.ceil(math.log2(max(pixels.shape[:2])))))
-    image = Image.fromarray(pixels).resize((side, side), Image.Resampling.BOX)
+    side = min(LARGEST_SIDE, 1 << max(0, math.ceil(math.log2(max(shape[:2])))))
+    whole = Image.fromarray(np.frombuffer(pixels, dtype=np.uint8).reshape(shape))
+    image = whole.resize((side, side), Image.Resampling.BOX)
     levels: list[NDArray[np.uint32]] = []
     log2_side = side.bit_length() - 1
     for level in range(log2_side + 1):
@@ -68,7 +55,7 @@ def pack(images: list[Pixels]) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
     table = np.zeros((max(1, len(images)), MIP_LEVELS + 1), dtype=np.int64)
     start = 2
     for row, image in enumerate(images):
-        levels, log2_side = pyramid(image)
+        levels, log2_side = pyramid(image.shape, image.tobytes())
         for level, data in enumerate(levels):
             table[row, level] = start
             texels.append(data)
