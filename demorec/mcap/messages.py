@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -93,23 +93,6 @@ def image(time_ns: int, frame_id: str, encoding: str, size: tuple[int, int], dat
     return _stamped(head, time_ns, data)
 
 
-def read_compressed_image(data: bytes) -> bytes:
-    """Decode the encoded image of a `compressed_image`."""
-    start = _compressed_image_start(data)
-    (length,) = _U32.unpack_from(data, start - 4)
-    image = data[start : start + length]
-    if len(image) != length:
-        raise ValueError("a truncated image")
-    return image
-
-
-def packet_reader(codec: str) -> Callable[[bytes], bytes]:
-    """Return the function that extracts a camera's packet from its message."""
-    if codec == "32FC1":
-        return lambda data: bytes(decode(IMAGE, data)[0]["data"])
-    return read_protobuf_video if codec == "av1" else read_compressed_image
-
-
 def _compressed_image_start(data: bytes) -> int:
     """Find the offset of the image in a message; the four bytes before are its length."""
     # Encapsulation (4 bytes) and timestamp (8), then two strings and the octets, each after its length, which starts at
@@ -123,8 +106,9 @@ def _compressed_image_start(data: bytes) -> int:
 
 def coded_images(block: Block, codec: str) -> Block:
     """Extract the encoded images from the messages of a camera; ValueError if one is not an image."""
-    if codec == "av1":
-        images = [read_protobuf_video(message) for message in block.messages()]
+    if codec in ("av1", "32FC1"):
+        read = read_protobuf_video if codec == "av1" else _read_pixels
+        images = [read(message) for message in block.messages()]
         lengths = np.array([len(image) for image in images], dtype=np.int64)
         return replace(block, content=b"".join(images), starts=np.cumsum(lengths) - lengths, lengths=lengths)
     if not len(block):
@@ -139,6 +123,10 @@ def coded_images(block: Block, codec: str) -> Block:
     if (lengths > block.lengths - start).any():
         raise ValueError("a truncated image")
     return replace(block, starts=block.starts + start, lengths=lengths)
+
+
+def _read_pixels(data: bytes) -> bytes:
+    return bytes(decode(IMAGE, data)[0]["data"])
 
 
 def protobuf_video(time_ns: int, frame_id: str, video_format: str, data: bytes) -> bytes:

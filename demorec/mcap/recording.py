@@ -172,7 +172,7 @@ class Recording(Closing):
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """Yield the encoded images of a camera, in order; `frame_index` is the image number that frames refer to."""
         codec = self.video_settings(camera).codec
-        images = self._read_images(self._image_topic(camera), messages.packet_reader(codec))
+        images = self._read_images(self._image_topic(camera), codec)
         for number, (time_ns, data) in enumerate(images):
             yield VideoPacket(frame_index=number, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
 
@@ -180,15 +180,17 @@ class Recording(Closing):
         """Compute (T,) due times of all images of a simulation; elsewhere the cameras decide."""
         return None if self.info.simulation is None else frame_times(self.num_frames, self.info.fps)
 
-    def _read_images[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
-        """Read as `_read`, for a topic of images; RecordingError unless they are at their due times."""
-        due_ns = self._due_ns()
-        due = None if due_ns is None else iter(due_ns)
-        for time_ns, image in self._read(topic, read):
-            if due is not None and time_ns != next(due, None):
-                raise self._wrong_times(topic)
-            yield time_ns, image
-        if due is not None and next(due, None) is not None:
+    def _read_images(self, topic: str, codec: str = "png") -> Iterator[tuple[int, bytes]]:
+        """Yield (time_ns, encoded image) of a topic of images; RecordingError unless they are at their due times."""
+        due_ns, count = self._due_ns(), 0
+        with damage_as_recording_error(self.path):
+            for blocks in self._container.blocks_by_chunk((topic,)):
+                block = messages.coded_images(blocks[topic], codec)
+                if due_ns is not None and not np.array_equal(block.time_ns, due_ns[count : count + len(block)]):
+                    raise self._wrong_times(topic)
+                count += len(block)
+                yield from zip(block.time_ns.tolist(), block.messages(), strict=True)
+        if due_ns is not None and count != len(due_ns):
             raise self._wrong_times(topic)
 
     def _wrong_times(self, topic: str) -> RecordingError:
@@ -203,9 +205,9 @@ class Recording(Closing):
     def distances(self, camera: str) -> Iterator[NDArray[np.uint16] | NDArray[np.float32]]:
         """Yield distances in order, as recorded: (H, W) uint16 millimetres or float32 metres."""
         codec, size = self._distance_codec(camera), self._size(camera)
-        topic, read = channels.video_topic(camera, codec), messages.packet_reader(codec)
-        images = self._read_images(topic, lambda data: decode_distances(codec, read(data), size))
-        return (distances for _, distances in images)
+        with damage_as_recording_error(self.path):
+            for _, data in self._read_images(channels.video_topic(camera, codec), codec):
+                yield decode_distances(codec, data, size)
 
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
         """Yield distances in metres, (H, W) float32; in simulations in steps of a millimetre, 0 for the background."""
@@ -354,8 +356,9 @@ class Recording(Closing):
         if not self.has_segmentation(camera):
             raise RecordingError(f"The recording has no segmentation images of the camera {camera!r}: {self.path}")
         topic, decoder = channels.camera_topic(camera, "segmentation"), LabelDecoder(self._size(camera))
-        for _, labels in self._read_images(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
-            yield labels
+        with damage_as_recording_error(self.path):
+            for _, data in self._read_images(topic):
+                yield decoder.decode(data)
 
     def segment_names(self) -> dict[int, str]:
         """Return segmentation value -> name of the body, or ROBOT/LINK; empty if segmentation was not recorded."""
