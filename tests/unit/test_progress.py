@@ -33,18 +33,18 @@ def lines_of(
 
 
 def test_a_line_has_progress_and_time(capsys: pytest.CaptureFixture[str]) -> None:
-    lines = lines_of(capsys, total=40, seconds_each=5.0, note="2 failed attempts")
-    assert lines[0] == "generating: 2 of 40 episodes (5 %), 00:10 passed, 2 failed attempts"
-    assert lines[1] == "generating: 4 of 40 episodes (10 %), 00:20 passed, 2 failed attempts"
+    lines = lines_of(capsys, total=40, seconds_each=30.0, note="2 failed attempts")
+    assert lines[0] == "generating: 2 of 40 episodes (5 %), 01:00 passed, 2 failed attempts"
+    assert lines[1] == "generating: 4 of 40 episodes (10 %), 02:00 passed, 2 failed attempts"
 
 
 @pytest.mark.parametrize(
     ("total", "seconds_each", "fewest", "most"),
     [
-        (3, 3.0, 0, 0),
-        (9000, 0.001, 0, 0),
-        (100_000, 0.001, 9, 10),  # 100 s: every 10 s
-        (8640, 10.0, 300, 360),  # a day: every five minutes after the first hours
+        (3, 10.0, 0, 0),
+        (9000, 0.005, 0, 0),
+        (130_000, 0.001, 2, 2),
+        (60, 120.0, 60, 60),
     ],
 )
 def test_lines_are_neither_too_many_nor_too_few(

@@ -127,19 +127,14 @@ def size_in_words(num_bytes: float) -> str:
     return f"{num_bytes / 1e3:.0f} kB"
 
 
-_QUIET_S = 10.0
-"""Minimum time before the first line and between lines; a shorter job prints none."""
-_SHARE = 0.05
-"""Part of the elapsed time after which the next line is due."""
-_LONGEST_S = 300.0
-"""Time after which the next line is due in any case."""
+_QUIET_S = 60.0
+"""Minimum time before the first line of progress and between lines, seconds; a shorter job prints none."""
 
 
 class ProgressBar(Closing):
     """Progress counter of one job; a context manager.
 
-    Shows a bar on a terminal. Elsewhere it prints a line when an item ends, at most every ten seconds, in a long job
-    every five minutes.
+    Shows a bar on a terminal. Elsewhere it prints a line when an item ends, at most one a minute.
 
     Args:
         title: Activity, as in "exporting".
@@ -193,10 +188,9 @@ class ProgressBar(Closing):
 
     def _write_line_if_due(self) -> None:
         now = self._clock()
-        passed_s = now - self._started
-        if now - self._last_line < max(_QUIET_S, min(_LONGEST_S, _SHARE * passed_s)):
+        if now - self._last_line < _QUIET_S:
             return
         self._last_line = now
         share = f" of {self.total} {self._unit}s ({100 * self.done // self.total} %)" if self.total else ""
-        words = [f"{self._title}: {self.done}{share}", f"{tqdm.format_interval(passed_s)} passed", self._note]
+        words = [f"{self._title}: {self.done}{share}", f"{tqdm.format_interval(now - self._started)} passed", self._note]
         tell(", ".join(filter(None, words)))
