@@ -146,6 +146,7 @@ Reader = Callable[[memoryview, int], tuple[Any, int]]
 """Function of bytes and an offset; returns the value there and the offset after it."""
 
 _MAX_DEPTH = 32
+"""Maximum depth of types nested in a type; types that were read before may double it."""
 
 
 class Readers:
@@ -158,27 +159,23 @@ class Readers:
 
     def __init__(self, types: Types, *, order: str = "<", is_aligned: bool = True) -> None:
         self._types, self._order, self._is_aligned = types, order, is_aligned
-        self._made: dict[str, tuple[Reader, int]] = {}
+        self._made: dict[str, Reader] = {}
 
     def of(self, kind: str) -> Reader:
         """Return the reader of a type; ValueError if it refers to an undefined type, or to itself."""
-        return self._message(kind, 0)[0]
+        return self._message(kind, 0)
 
-    def _message(self, kind: str, depth: int) -> tuple[Reader, int]:
-        """Return a reader, and the depth of the types nested in its type."""
-        found = self._made.get(kind)
-        if depth + (found[1] if found else 0) > _MAX_DEPTH:
+    def _message(self, kind: str, depth: int) -> Reader:
+        if depth > _MAX_DEPTH:
             raise ValueError("its definition is nested too deeply")
-        if found is None:
-            found = self._made[kind] = self._new(kind, depth)
-        return found
+        if kind not in self._made:
+            self._made[kind] = self._new(kind, depth)
+        return self._made[kind]
 
-    def _new(self, kind: str, depth: int) -> tuple[Reader, int]:
-        parts = [(field.name, *self._field(field, depth)) for field in self._types[kind]]
-        height = max((below for _, _, below in parts), default=0)
-        readers = [(name, reader) for name, reader, _ in parts]
+    def _new(self, kind: str, depth: int) -> Reader:
+        readers = [(field.name, self._field(field, depth)) for field in self._types[kind]]
         if not readers and self._is_aligned:  # ROS 2 gives a type without fields a byte
-            return lambda data, position: ({}, position + 1), height
+            return lambda data, position: ({}, position + 1)
 
         def read(data: memoryview, position: int) -> tuple[Values, int]:
             values = {}
@@ -186,18 +183,18 @@ class Readers:
                 values[field], position = read_field(data, position)
             return values, position
 
-        return read, height
+        return read
 
-    def _field(self, field: FieldType, depth: int) -> tuple[Reader, int]:
+    def _field(self, field: FieldType, depth: int) -> Reader:
         if field.is_array and field.kind in _CODES:
-            return self._numbers(field.kind, field.length), 0
+            return self._numbers(field.kind, field.length)
         if field.kind in self._types:
-            reader, height = self._message(field.kind, depth + 1)
+            reader = self._message(field.kind, depth + 1)
         elif "/" in field.kind:
             raise ValueError(f"its definition lacks the type {field.kind[:80]!r}")
         else:
-            reader, height = self._scalar(field.kind), -1
-        return (self._list(reader, field.length) if field.is_array else reader), height + 1
+            reader = self._scalar(field.kind)
+        return self._list(reader, field.length) if field.is_array else reader
 
     def _scalar(self, kind: str) -> Reader:
         if kind == "string":

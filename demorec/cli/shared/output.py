@@ -192,5 +192,6 @@ class ProgressBar(Closing):
             return
         self._last_line = now
         share = f" of {self.total} {self._unit}s ({100 * self.done // self.total} %)" if self.total else ""
-        words = [f"{self._title}: {self.done}{share}", f"{tqdm.format_interval(now - self._started)} passed", self._note]
+        passed = tqdm.format_interval(now - self._started)
+        words = [f"{self._title}: {self.done}{share}", f"{passed} passed", self._note]
         tell(", ".join(filter(None, words)))

@@ -36,21 +36,14 @@ FACE_SEGMENT = 2
 FACE_GROUP = 3
 SMOOTH = 1  # a bit of FACE_FLAGS
 TEXTURED = 2  # the next bit
-FACE_RED = 0
-FACE_GREEN = 1
-FACE_BLUE = 2
-FACE_SPECULAR = 3
+FACE_SPECULAR = 3  # after red, green, blue
 
 # Columns of a record: data of a triangle for shading. Each quantity q is a plane over the image, as value at the
 # origin, step in x, step in y. All but the first, the inverse depth, are divided by depth, which makes them planes.
-SHADOW_X_PLANE = 3
-SHADOW_Y_PLANE = 6
-SHADOW_Z_PLANE = 9
+SHADOW_X_PLANE = 3  # then y and z
 TO_LIGHT_PLANE = 12
-UPWARD_PLANE = 15
-HALFWAY_PLANE = 18
-TEX_U_PLANE = 21
-TEX_V_PLANE = 24
+UPWARD_PLANE = 15  # then the half-way vector
+TEX_U_PLANE = 21  # then v
 TEXEL_DENSITY = 27  # (texture widths / sample)^2 at inverse depth 1
 RECORD = 28
 
