@@ -149,7 +149,8 @@ def chunk_content(record: bytes | memoryview, expected_size: int | None = None) 
     stream, size = get_chunk_data_stream(chunk, validate_crc=True)
     if size != chunk.uncompressed_size or expected_size not in (None, size):
         raise ValueError("a chunk has another size than stated")
-    return stream.read(size)
+    content: bytes = stream.read(size)
+    return content
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

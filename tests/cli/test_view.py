@@ -38,7 +38,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("folder", (), "The folder holds no recording"),
         ("runs", (), "it holds runs: name one (cubes)"),
         ("saved.rrd", (), "rerun shows it"),
-        ("nothing.mcap", (), "does not exist"),
+        ("nothing.mcap", (), "No such file"),
         ("episode.mcap", ("--save", "x.mp4"), "writes a .rrd file"),
         ("episode.mcap", ("--port", "80"), "--port belongs to --web"),
         ("episode.mcap", ("--web", "--save", "x.rrd"), "--web serves"),
@@ -57,8 +57,9 @@ def test_an_impossible_request_is_one_sentence(
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    for file in ("video.mp4", "cut.mcap.part", "saved.rrd"):
-        Path(file).write_bytes(b"RRF2")
+    Path("saved.rrd").write_bytes(b"RRF2")
+    for file in ("video.mp4", "cut.mcap.part"):
+        Path(file).write_bytes(b"0123456789")
     Path("folder").mkdir()
     Path("runs/cubes/episodes").mkdir(parents=True)
     write_episode(Path("episode.mcap"), num_frames=5, cameras=())
