@@ -10,13 +10,11 @@ from __future__ import annotations
 import zlib
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
-from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
 from mcap.opcode import Opcode
-from mcap.records import Channel, ChunkIndex, Footer, Metadata, MetadataIndex, Schema, Statistics
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, ChunkIndex, Footer, Metadata, MetadataIndex, Statistics
 
 from demorec.core.errors import RecordingError, ResourceError, describe_error, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular
@@ -26,7 +24,10 @@ from demorec.mcap.scan import (
     Block,
     blocks_of,
     chunk_content,
+    read_channel,
     read_record,
+    read_schema,
+    records_in,
 )
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
@@ -98,11 +99,11 @@ class Container:
         footer = read_record(self._content_at(footer_start, _FOOTER_BYTES, Opcode.FOOTER), Footer)
         if not len(MCAP_MAGIC) <= footer.summary_start < footer_start:
             raise ValueError("it has no index")
-        summary = self._read_at(footer.summary_start, size - footer.summary_start)
         # The checksum covers the summary and the footer up to the checksum itself.
-        if footer.summary_crc and zlib.crc32(summary[: -len(MCAP_MAGIC) - 4]) != footer.summary_crc:
+        summary = self._read_at(footer.summary_start, footer_start - footer.summary_start + _FOOTER_BYTES - 4)
+        if footer.summary_crc and zlib.crc32(summary) != footer.summary_crc:
             raise ValueError("the checksum of its index does not match")
-        self._parse_summary(summary)
+        self._parse_summary(summary[: footer_start - footer.summary_start])
 
     def _parse_summary(self, summary: bytes) -> None:
         channels: dict[int, Channel] = {}
@@ -110,17 +111,21 @@ class Container:
         self._chunks: list[ChunkIndex] = []
         self.metadata_index: dict[str, MetadataIndex] = {}
         counts: dict[int, int] = {}
-        for record in StreamReader(BytesIO(summary), skip_magic=True).records:
-            if isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Schema):
-                self.schemas[record.id] = record
-            elif isinstance(record, ChunkIndex):
-                self._chunks.append(record)
-            elif isinstance(record, MetadataIndex):
-                self.metadata_index[record.name] = record
-            elif isinstance(record, Statistics):
-                counts = record.channel_message_counts
+        for opcode, start, end in records_in(summary, "the file's index"):
+            content = summary[start:end]
+            if opcode == Opcode.CHANNEL:
+                channel = read_channel(content)
+                channels[channel.id] = channel
+            elif opcode == Opcode.SCHEMA:
+                schema = read_schema(content)
+                self.schemas[schema.id] = schema
+            elif opcode == Opcode.CHUNK_INDEX:
+                self._chunks.append(read_record(content, ChunkIndex))
+            elif opcode == Opcode.METADATA_INDEX:
+                metadata = read_record(content, MetadataIndex)
+                self.metadata_index[metadata.name] = metadata
+            elif opcode == Opcode.STATISTICS:
+                counts = dict(read_record(content, Statistics).channel_message_counts)
         self._chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
         for channel in channels.values():
             if channel.schema_id not in self.schemas:

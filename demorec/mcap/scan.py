@@ -10,8 +10,9 @@ from __future__ import annotations
 import os
 import struct
 from array import array
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from io import BytesIO
 from typing import BinaryIO, NamedTuple
 
@@ -73,6 +74,19 @@ def read_record[R: McapRecord](content: bytes | memoryview, kind: type[R]) -> R:
     return record
 
 
+# These bytes are the same in every recording of a run, and an export opens many.
+@lru_cache(maxsize=1024)
+def read_channel(content: bytes) -> Channel:
+    """Parse a Channel record."""
+    return read_record(content, Channel)
+
+
+@lru_cache(maxsize=256)
+def read_schema(content: bytes) -> Schema:
+    """Parse a Schema record."""
+    return read_record(content, Schema)
+
+
 def scan(file: BinaryIO) -> Iterator[ScannedMessage | Metadata | None]:
     """Yield the messages and metadata of a file, open at its first record, in order, and None at the end of each chunk.
 
@@ -89,10 +103,10 @@ def scan(file: BinaryIO) -> Iterator[ScannedMessage | Metadata | None]:
         elif opcode == Opcode.METADATA:
             yield read_record(data[start:end], Metadata)
         elif opcode == Opcode.SCHEMA:
-            schema = read_record(data[start:end], Schema)
+            schema = read_schema(data[start:end])
             schemas[schema.id] = schema
         else:
-            found = read_record(data[start:end], Channel)
+            found = read_channel(data[start:end])
             schema = schemas[found.schema_id]
             channels[found.id] = ScannedChannel(
                 topic=found.topic,
@@ -118,7 +132,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[int, bytes, int, int]]:
             return
         if opcode == Opcode.CHUNK:
             content = chunk_content(file.read(length))
-            for inner, start, end in _records_in(content):
+            for inner, start, end in records_in(content):
                 if inner in _IN_CHUNKS:
                     yield inner, content, start, end
             yield opcode, b"", 0, 0
@@ -128,7 +142,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[int, bytes, int, int]]:
             file.seek(length, os.SEEK_CUR)
 
 
-def _records_in(content: bytes) -> Iterator[tuple[int, int, int]]:
+def records_in(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, int, int]]:
     """Yield (opcode, start, end) of the records' contents; ValueError or struct.error unless they fill the bytes."""
     position, end = 0, len(content)
     while position < end:
@@ -136,7 +150,7 @@ def _records_in(content: bytes) -> Iterator[tuple[int, int, int]]:
         start = position + RECORD_HEAD.size
         position = start + length
         if position > end:
-            raise ValueError("a record that extends beyond its chunk")
+            raise ValueError(f"a record that extends beyond {where}")
         yield opcode, start, position
 
 
@@ -195,15 +209,11 @@ class Block:
 
 
 def blocks_of(contents: Iterable[bytes], topics: Mapping[str, int]) -> dict[str, Block]:
-    """Collect topic -> its messages from the contents of chunks, given topic -> channel.
-
-    ValueError or struct.error unless records fill the chunks.
-    """
+    """Collect topic -> its messages from the contents of chunks, given topic -> channel; errors as in `records_in`."""
     found = array("q")
     joined = BytesIO()
     for chunk in contents:
-        offset = joined.tell() - RECORD_HEAD.size
-        found.extend([offset + start for _, start, _ in _records_in(chunk)])
+        _find_records(chunk, joined.tell(), found.append)
         joined.write(chunk)
     content = joined.getvalue()
     values = np.frombuffer(content, dtype=np.uint8)
@@ -231,3 +241,14 @@ def _gathered(values: NDArray[np.uint8], starts: NDArray[np.int64], length: int)
         part = slice(first, first + _GATHERED_ROWS)
         rows[part] = values[starts[part, np.newaxis] + places]
     return rows
+
+
+def _find_records(content: bytes, offset: int, found: Callable[[int], None]) -> None:
+    """Report the offset of each record of a chunk, counted from `offset`."""
+    unpack, head_bytes = RECORD_HEAD.unpack_from, RECORD_HEAD.size
+    position, end = 0, len(content)
+    while position < end:
+        found(offset + position)
+        position += unpack(content, position)[1] + head_bytes
+    if position != end:
+        raise ValueError("a record that extends beyond its chunk")
