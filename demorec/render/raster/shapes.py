@@ -97,6 +97,7 @@ class Model:
     texture: Path | None
     coarse: RasterMesh | None = None
     _pieces: dict[Any, Piece] = field(default_factory=dict)
+    _spheres: dict[bytes, tuple[Floats, float]] = field(default_factory=dict)
 
     def piece(self, target: int | None, *, textured: bool) -> Piece:
         """Return the mesh with about `target` faces (None: all), prepared for drawing; computed once."""
@@ -118,9 +119,12 @@ class Model:
 
     def bounding_sphere(self, scale: Floats) -> tuple[Floats, float]:
         """Compute centre (3,) and radius of a sphere around the scaled mesh."""
-        points = self.points * scale
-        centre = (points.min(0) + points.max(0)) / 2
-        return centre, float(np.sqrt(((points - centre) ** 2).sum(1).max()))
+        place = scale.tobytes()
+        if place not in self._spheres:
+            points = self.points * scale
+            centre = (points.min(0) + points.max(0)) / 2
+            self._spheres[place] = centre, float(np.sqrt(((points - centre) ** 2).sum(1).max()))
+        return self._spheres[place]
 
 
 def _model_of(mesh: RasterMesh, *, key: str, read: Callable[[], RasterMesh], coarse: RasterMesh | None = None) -> Model:
