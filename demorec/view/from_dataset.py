@@ -85,7 +85,7 @@ class _SimulatedEpisode(DatasetRecording):
 
     def __init__(self, dataset: LeRobotFolder, number: int) -> None:
         super().__init__(dataset, number)
-        (self._row,) = dataset.sidecar_rows("episodes", self.place.episode_index)
+        self._row = dataset.sidecar_row(self.place.episode_index)
         self._phases = _phases(self._row, self.num_frames)
         if self.robot is not None:
             check_primitives(self.robot.urdf)
@@ -122,15 +122,23 @@ class _SimulatedEpisode(DatasetRecording):
         fingers = self._spec.gripper.joint_position(state[:, count])
         ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in self._row["objects"]}
         poses = self._object_poses(data[ENVIRONMENT_STATE]) if ENVIRONMENT_STATE in data else {}
-        rows = self.dataset.sidecar_rows("camera_poses", self.place.episode_index)
-        moving = [name for name in (rows[0] if rows else {}) if name not in ("episode_index", "frame_index")]
         return SceneMotion(
             joint_position=dict(zip(self._spec.joint_names, [*state[:, :count].T, *fingers.T], strict=True)),
             base_from_tcp=data.get(EE_POSE),
             object_poses=poses,
             end_poses=ends,
-            world_from_camera={name: np.array([row[name] for row in rows]) for name in moving},
+            world_from_camera=self._camera_poses(data[EE_POSE]) if EE_POSE in data else {},
         )
+
+    def _camera_poses(self, base_from_tcp: Array) -> dict[str, Array]:
+        """Compute name -> (T, 7) of the cameras on the hand from (T, 7) TCP poses."""
+        scene = self.info.simulated.scene
+        tcp = [scene.robot.world_from_base @ Pose(position=row[:3], quat_xyzw=row[3:]) for row in base_from_tcp]
+        return {
+            camera.name: np.array([(pose @ camera.mount_from_camera).vector() for pose in tcp])
+            for camera in scene.cameras
+            if camera.mount == self._spec.tcp_link
+        }
 
     def _object_poses(self, values: Array) -> dict[str, Array]:
         """Read name -> (T, 7) from the rows of `observation.environment_state`."""

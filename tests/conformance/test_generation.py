@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.commands import exit_code
 
@@ -18,6 +19,7 @@ from demorec.datasets.lerobot.verify import Verifier
 from demorec.generate.export_step import export_run
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.generate.run import generate
+from demorec.mcap import Recording
 from demorec.runs.run_file import load_run_file
 
 CONFIG = GenerateConfig(seed=11, width=48, height=32)
@@ -81,6 +83,14 @@ def test_a_dataset_of_few_features_can_be_shown(tmp_path: Path, reference: RunRe
         assert shown.motion.base_from_tcp is None
         assert not {"velocity", "ee", "target"} & shown.curves.keys()
         assert tuple(shown.videos) == ("wrist",)
+    export_lerobot([reference.folder], tmp_path / "all", ExportOptions(verify=False))
+    with (
+        Recording(reference.folder / "episodes" / "episode_000001.mcap") as recording,
+        open_dataset_episode(LeRobotFolder(tmp_path / "all"), 1) as shown,
+    ):
+        recorded = recording.trajectory().world_from_camera["wrist"]
+        # the simulator's pose against that of the TCP, which the dataset stores as float32
+        assert np.allclose(shown.motion.world_from_camera["wrist"][:, :3], recorded[:, :3], atol=1e-5)
 
 
 def reproduce(source: Path, out: Path) -> int:

@@ -42,7 +42,6 @@ DAMAGED = (
     "data/chunk-000/file-000.parquet",
     "videos/observation.images.wrist/chunk-000/file-000.mp4",
     "demorec/episodes/chunk-000/file-000.parquet",
-    "demorec/camera_poses/chunk-000/file-000.parquet",
     "demorec/configs.json",
 )
 

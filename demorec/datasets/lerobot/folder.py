@@ -35,7 +35,7 @@ from demorec.datasets.lerobot.files import open_table, read_json, read_table, ta
 from demorec.datasets.lerobot.language import COLUMNS
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, DatasetInfo
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.rows import OWN_COUNTERS, DataRows, IndexedRows
+from demorec.datasets.lerobot.rows import OWN_COUNTERS, DataRows, EpisodeTable
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
 
 # Code for videos, images, robots and the sidecar takes longer to load than most datasets' numbers to read.
@@ -99,7 +99,6 @@ class LeRobotFolder:
         self.camera = cache(self._camera)
         self.robot = cache(self._robot)
         self.boxes = cache(self._stored_boxes)
-        self._sidecar_index = cache(lambda table: IndexedRows(self.sidecar_tables(table), rows=64))
 
     def _video_file(self, path: Path) -> VideoFile:
         from demorec.datasets.lerobot.videos import VideoFile
@@ -287,24 +286,27 @@ class LeRobotFolder:
         keys = [name for name, feature in self.info.features.items() if feature.dtype == "image"]
         return {key: StoredImages(self.rows([key])) for key in keys}
 
-    def sidecar_tables(self, table: str) -> list[Path]:
-        """List the files of a table of the sidecar: "episodes" or "camera_poses"."""
-        return tables_in(self.root, f"{SIDECAR_DIR}/{table}")
+    @property
+    def sidecar_tables(self) -> list[Path]:
+        """The files of the sidecar's table of episodes; none without a sidecar."""
+        return tables_in(self.root, f"{SIDECAR_DIR}/episodes")
 
-    def sidecar_rows(self, table: str, episode_index: int) -> list[dict[str, Any]]:
-        """Read all rows of an episode in a table of the sidecar."""
-        found = self._sidecar_index(table).read(episode_index)
-        return [] if found is None else found.to_pylist()
+    @cached_property
+    def _sidecar_table(self) -> EpisodeTable:
+        from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
+
+        return EpisodeTable(self.sidecar_tables, EPISODE_SCHEMA)
+
+    def sidecar_row(self, episode_index: int) -> dict[str, Any]:
+        """Read the sidecar's whole row of an episode; empty if it has none."""
+        return self._sidecar_table.row(episode_index)
 
     def sidecar(self, names: Sequence[str]) -> list[dict[str, Any]]:
         """Read columns of the sidecar's row of every episode, None if a table lacks one; empty without a sidecar."""
-        tables = self.sidecar_tables("episodes")
-        if not tables:
-            return []
         from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 
         found: list[dict[str, Any]] = []
-        for path in tables:
+        for path in self.sidecar_tables:
             stored = open_table(path, ["episode_index"]).schema_arrow.names
             there = [name for name in ("episode_index", *names) if name in stored]
             found += [dict.fromkeys(names) | row for row in read_table(path, there, schema=EPISODE_SCHEMA).to_pylist()]

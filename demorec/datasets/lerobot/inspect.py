@@ -47,9 +47,9 @@ def known_units(folder: LeRobotFolder) -> Mapping[str, tuple[str, ...]]:
     digests = (row["robot_digest"] for row in folder.sidecar(["robot_digest"]))
     digest = next((digest for digest in digests if digest), None)
     found = {} if digest is None else dict(folder.robot(digest).record.units)
-    for row in folder.sidecar_rows("episodes", 0):
-        if row.get("episode_info") is not None:
-            found = {feature.name: feature.units for feature in recorded_info(row, folder.root).features} | found
+    row = folder.sidecar_row(0)
+    if row.get("episode_info") is not None:
+        found = {feature.name: feature.units for feature in recorded_info(row, folder.root).features} | found
     state, action = (folder.info.features.get(name) for name in (STATE, ACTION))
     if STATE in found and state is not None and action is not None and state.names == action.names:
         found.setdefault(ACTION, found[STATE])

@@ -46,7 +46,6 @@ STATS_PATH = "meta/stats.json"
 OLD_EPISODES_PATH, OLD_TASKS_PATH = "meta/episodes.jsonl", "meta/tasks.jsonl"
 
 SIDECAR_EPISODES_PATH = f"{SIDECAR_DIR}/episodes/{_CHUNK}.parquet"
-SIDECAR_CAMERAS_PATH = f"{SIDECAR_DIR}/camera_poses/{_CHUNK}.parquet"
 
 FeatureType = Literal["float32", "float64", "int64", "bool", "string", "video", "image", "language"]
 

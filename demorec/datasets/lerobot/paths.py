@@ -31,7 +31,7 @@ _PARTS = re.compile(
     rf"|videos/[^/]+/chunk-\d+/{_NUMBERED}\.mp4"
     rf"|videos/chunk-\d+/[^/]+/{_NUMBERED}\.mp4"
     r"|images/[^/]+/episode[-_]\d+/frame[-_]\d+\.(png|jpe?g|tiff?)"
-    rf"|{SIDECAR_DIR}/(episodes|camera_poses)/chunk-\d+/file-\d+\.parquet"
+    rf"|{SIDECAR_DIR}/episodes/chunk-\d+/file-\d+\.parquet"
     rf"|{SIDECAR_DIR}/boxes/[^/]+\.json"
     rf"|{SIDECAR_DIR}/robots/[0-9a-f]{{16}}\.(json|urdf)"
     rf"|{SIDECAR_DIR}/(configs\.json|export\.json|README\.md)"

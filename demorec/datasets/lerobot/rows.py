@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.episode_places import EpisodePlace
-from demorec.datasets.lerobot.files import TableReader, column_numbers, open_table, table_batches
+from demorec.datasets.lerobot.files import TableReader, column_numbers, table_batches
 from demorec.datasets.lerobot.language import column_digests
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 from demorec.datasets.lerobot.paths import INFO_PATH
@@ -181,59 +181,45 @@ def _image_digests(column: pa.Array) -> NDArray[np.str_]:
     return np.array(digests, dtype=np.str_).reshape(-1, 1)
 
 
-class IndexedRows:
-    """Rows of tables with a column `episode_index`, by episode.
+class EpisodeTable:
+    """Tables with one row for each episode, found by the column `episode_index`.
 
     Args:
         paths: The tables.
-        schema: Columns to read, null if a table lacks one; default those of the first table.
-        rows: Maximum number of rows in a batch.
+        schema: Columns to read, null if a table lacks one.
 
     Methods raise ExportError if the tables cannot be read.
     """
 
-    def __init__(self, paths: Sequence[Path], schema: pa.Schema | None = None, *, rows: int) -> None:
-        self._parts: dict[int, list[tuple[Path, int, int]]] = {}
+    def __init__(self, paths: Sequence[Path], schema: pa.Schema) -> None:
+        self._schema = schema
+        self._places: dict[int, tuple[Path, int]] = {}
         for path in paths:
-            there, first = open_table(path, ["episode_index"]).schema_arrow, 0
-            schema = schema or there.remove_metadata()
+            first = 0
             for batch in table_batches(path, ["episode_index"], rows=_INDEX_ROWS):
-                episodes = column_numbers(batch.column(0))[:, 0]
-                begins = [0, *(np.flatnonzero(np.diff(episodes)) + 1).tolist()]
-                for begin, end in zip(begins, [*begins[1:], len(episodes)], strict=True):
-                    self._parts.setdefault(int(episodes[begin]), []).append((path, first + begin, end - begin))
+                episodes = column_numbers(batch.column(0))[:, 0].tolist()
+                self._places |= {int(number): (path, first + row) for row, number in enumerate(episodes)}
                 first += len(batch)
-        self._schema = schema or pa.schema([])
-        self._tables = TableReader(["episode_index"], optional=self._schema.names, rows=rows)
+        self._tables = TableReader(["episode_index"], optional=schema.names)
 
-    def read(self, episode_index: int) -> pa.Table | None:
-        """Read all rows of an episode; None if it has none."""
-        batches = [
-            self._conformed(batch, path)
-            for path, first, count in self._parts.get(episode_index, ())
-            for batch in self._tables.read(path, first, count)
-        ]
-        return pa.Table.from_batches(batches) if batches else None
+    def row(self, episode_index: int) -> dict[str, Any]:
+        """Read the last row of an episode; empty if it has none."""
+        if episode_index not in self._places:
+            return {}
+        path, number = self._places[episode_index]
+        row: dict[str, Any] = dict.fromkeys(self._schema.names)
+        for batch in self._tables.read(path, number, 1):
+            for item in self._schema:
+                if item.name in batch.schema.names:
+                    row[item.name] = _cast(batch.column(item.name), item.type, path)[0].as_py()
+        return row
 
-    def frames(self, episode_index: int, first: int, last: int) -> pa.Table | None:
-        """Read the rows with a `frame_index` of `first` to `last` - 1, in order."""
-        if (rows := self.read(episode_index)) is None:
-            return None
-        frames = rows.column("frame_index").to_numpy()
-        kept = np.flatnonzero((frames >= first) & (frames < last))
-        return rows.take(pa.array(kept[np.argsort(frames[kept], kind="stable")]))
 
-    def _conformed(self, batch: pa.RecordBatch, path: Path) -> pa.RecordBatch:
-        try:
-            columns = [
-                batch.column(item.name).cast(item.type)
-                if item.name in batch.schema.names
-                else pa.nulls(len(batch), item.type)
-                for item in self._schema
-            ]
-            return pa.RecordBatch.from_arrays(columns, schema=self._schema)
-        except (ValueError, pa.ArrowException) as error:
-            raise ExportError(f"The table has columns with other types ({describe_error(error)}): {path}") from error
+def _cast(column: pa.Array, kind: pa.DataType, path: Path) -> pa.Array:
+    try:
+        return column.cast(kind)
+    except (ValueError, pa.ArrowException) as error:
+        raise ExportError(f"The table has columns with other types ({describe_error(error)}): {path}") from error
 
 
 class StoredImages:

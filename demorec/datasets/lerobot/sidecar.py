@@ -3,7 +3,6 @@
 - `episodes/`: one row per episode: its source (run's episode number, attempt, seed, config digest), its outcome (every
   check with value and limit), phases, cameras with intrinsics and extrinsics, final poses of objects, and
   `episode_info`: the complete description of scene and robot as JSON, from which `demorec` can rebuild the world.
-- `camera_poses/`: one row per frame, for cameras that move.
 - `robots/`: the arms as URDFs (`demorec.datasets.lerobot.robots`).
 - `configs.json`: config digest -> resolved configuration; `export.json`: options of the export.
 """
@@ -11,24 +10,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pyarrow as pa
 
 from demorec.core.files import Closing
-from demorec.core.geometry import Array
 from demorec.core.plain import to_json, to_plain
 from demorec.datasets.lerobot.files import write_text
-from demorec.datasets.lerobot.layout import (
-    SIDECAR_CAMERAS_PATH,
-    SIDECAR_EPISODES_PATH,
-    DatasetInfo,
-)
-from demorec.datasets.lerobot.parquet import RollingParquet, vector_array
+from demorec.datasets.lerobot.layout import SIDECAR_EPISODES_PATH, DatasetInfo
+from demorec.datasets.lerobot.parquet import RollingParquet
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.robots import DatasetRobot, robot_of, write_robot
 from demorec.episode.episode import Outcome, consecutive_runs
@@ -41,7 +34,7 @@ CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
 EXPORT_PATH = f"{SIDECAR_DIR}/export.json"
 
 _TEXT, _WHOLE, _NUMBER, _FLAG = pa.string(), pa.int64(), pa.float64(), pa.bool_()
-_POSE, _VECTOR = pa.list_(_NUMBER, 7), pa.list_(_NUMBER)
+_VECTOR = pa.list_(_NUMBER)
 _CHECK = pa.struct({"name": _TEXT, "value": _NUMBER, "limit": _NUMBER, "unit": _TEXT, "passed": _FLAG})
 _PHASE = pa.struct({"name": _TEXT, "from": _WHOLE, "to": _WHOLE})
 _OBJECT = pa.struct({"name": _TEXT, "world_from_object_end": _VECTOR})
@@ -87,13 +80,11 @@ class EpisodeRecord:
 
     Attributes:
         row: Row of the table of episodes, without the index.
-        moving_cameras: Camera -> (T, 7) world_from_camera of every frame in the dataset.
         config: Configuration of the run.
         robot: The arm; None if unknown.
     """
 
     row: Mapping[str, Any]
-    moving_cameras: Mapping[str, Array] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)
     robot: DatasetRobot | None = None
 
@@ -114,14 +105,7 @@ class EpisodeRecord:
         }
         if simulation is None:
             return cls(row=row, robot=robot)
-        poses = recording.trajectory().world_from_camera
-        moving = [camera.name for camera in info.cameras if camera.mount != "world"]
-        return cls(
-            row=row | _simulated_row(simulation, episode),
-            moving_cameras={name: poses[name][episode.rows] for name in moving},
-            config=simulation.config,
-            robot=robot,
-        )
+        return cls(row=row | _simulated_row(simulation, episode), config=simulation.config, robot=robot)
 
 
 def _simulated_row(simulation: Simulation, episode: ExportEpisode[Any]) -> dict[str, Any]:
@@ -161,7 +145,7 @@ def _described_camera(camera: Camera) -> dict[str, Any]:
 
 
 class SidecarWriter(Closing):
-    """Context manager that writes the sidecar's tables episode by episode; `finish` completes them.
+    """Context manager that writes the sidecar episode by episode; `finish` completes it.
 
     Args:
         root: Folder of the dataset; an existing sidecar is continued.
@@ -169,21 +153,13 @@ class SidecarWriter(Closing):
     """
 
     def __init__(self, root: Path, info: DatasetInfo, configs: Mapping[str, Any]) -> None:
-        self._root, self._info = root, info
-        self._tables: list[RollingParquet] = []
-        self._episodes = self._table(SIDECAR_EPISODES_PATH, EPISODE_SCHEMA)
-        self._camera_poses: RollingParquet | None = None
+        self._root = root
+        self._episodes = RollingParquet(root, SIDECAR_EPISODES_PATH, EPISODE_SCHEMA, info, compression="zstd")
         self._configs: dict[str, Any] = dict(configs)
 
-    def _table(self, template: str, schema: pa.Schema, repeating: Sequence[str] | None = None) -> RollingParquet:
-        table = RollingParquet(self._root, template, schema, self._info, compression="zstd", repeating=repeating)
-        self._tables.append(table)
-        return table
-
     def close(self) -> None:
-        """Close the tables without completing them."""
-        for table in self._tables:
-            table.abort()
+        """Close the table without completing it."""
+        self._episodes.abort()
 
     def add(self, episode_index: int, digest: str, record: EpisodeRecord) -> None:
         """Add an episode of the dataset and its digest."""
@@ -192,24 +168,9 @@ class SidecarWriter(Closing):
             write_robot(self._root, record.robot)
         if record.config:
             self._configs.setdefault(record.row["config_digest"], record.config)
-        if record.moving_cameras:
-            self._add_camera_poses(episode_index, record.moving_cameras)
-
-    def _add_camera_poses(self, episode_index: int, poses: Mapping[str, Array]) -> None:
-        if self._camera_poses is None:
-            schema = pa.schema(
-                [("episode_index", pa.int64()), ("frame_index", pa.int64()), *((name, _POSE) for name in poses)]
-            )
-            self._camera_poses = self._table(SIDECAR_CAMERAS_PATH, schema, repeating=["episode_index"])
-        frames = len(next(iter(poses.values())))
-        arrays = [pa.array(np.full(frames, episode_index)), pa.array(np.arange(frames))]
-        arrays += [vector_array(poses[name], _POSE) for name in self._camera_poses.schema.names[2:]]
-        self._camera_poses.make_room(frames)
-        self._camera_poses.write(pa.Table.from_arrays(arrays, schema=self._camera_poses.schema))
 
     def finish(self, export: Mapping[str, Any]) -> None:
-        """Close the tables and write the two JSON files."""
-        for table in self._tables:
-            table.close()
+        """Close the table and write the two JSON files."""
+        self._episodes.close()
         write_text(self._root / CONFIGS_PATH, json.dumps(self._configs, indent=2, sort_keys=True) + "\n")
         write_text(self._root / EXPORT_PATH, json.dumps(dict(export), indent=2, sort_keys=True) + "\n")

@@ -1,6 +1,6 @@
 """Files next to an edited dataset's tables, and the data of its sources that it omits.
 
-These are the sidecar's rows, robots, camera poses, boxes and progress. Omissions are known before anything is
+These are the sidecar's rows, robots, boxes and progress. Omissions are known before anything is
 written.
 """
 
@@ -12,22 +12,17 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ExportError, describe_error
-from demorec.core.geometry import Array
 from demorec.core.plain import listed, parse_json, to_json
 from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera
 from demorec.datasets.lerobot.dataset_features import MODALITY_PATH
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS
-from demorec.datasets.lerobot.files import column_numbers, open_table, read_json
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, SECOND_CARD_PATH, SIDECAR_DIR, is_dataset_file
-from demorec.datasets.lerobot.rows import IndexedRows
-from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord
+from demorec.datasets.lerobot.files import open_table, read_json
+from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, SECOND_CARD_PATH, is_dataset_file
+from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH, EpisodeRecord
 from demorec.extensions.editing.plan import EpisodeSlice, Plan
 
 _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "episode_info")
 """Columns that describe a simulated episode as recorded, and do not apply to a cut one."""
-_COUNTERS = ("episode_index", "frame_index")
-_ROWS_AT_ONCE = 4096
 _ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", MODALITY_PATH)
 """Files that are copied if all sources have the same."""
 _OF_OTHER_TOOLS = (".cache/", ".git/")
@@ -35,20 +30,6 @@ _OF_OTHER_TOOLS = (".cache/", ".git/")
 _COPIED = "copied"
 MAX_NAMES = 5
 """Maximum files listed of one kind."""
-
-
-def _moving_cameras(source: LeRobotFolder) -> tuple[str, ...] | None:
-    """Cameras with a pose for every frame; None if the files contradict each other."""
-    names = [open_table(path).schema_arrow.names for path in source.sidecar_tables("camera_poses")]
-    if any(each != names[0] for each in names):
-        return None
-    return tuple(name for name in (names[0] if names else ()) if name not in _COUNTERS)
-
-
-def _poses_are_kept(plan: Plan) -> bool:
-    """Whether all sources with moving cameras have the same ones."""
-    found = {_moving_cameras(source) for source in plan.sources} - {()}
-    return len(found) <= 1 and None not in found
 
 
 def has_progress(plan: Plan) -> bool:
@@ -71,9 +52,6 @@ class SidecarReader:
 
     def __init__(self, plan: Plan, number: int) -> None:
         self._plan, self._source = plan, plan.sources[number]
-        self._rows = IndexedRows(self._source.sidecar_tables("episodes"), EPISODE_SCHEMA, rows=64)
-        tables = self._source.sidecar_tables("camera_poses") if _poses_are_kept(plan) else ()
-        self._poses = IndexedRows(tables, rows=_ROWS_AT_ONCE)
         found = {name: self._source.boxes(mapping.feature) for name, mapping in plan.mappings[number].items()}
         self._boxes = {name: boxes for name, boxes in found.items() if boxes is not None}
 
@@ -85,9 +63,7 @@ class SidecarReader:
     def record(self, cut: EpisodeSlice) -> EpisodeRecord:
         """Return the sidecar's data about an episode."""
         source = self._source
-        index = source.places[cut.episode].episode_index
-        table = self._rows.read(index)
-        row: dict[str, Any] = {} if table is None else table.drop_columns("episode_index").to_pylist()[-1]
+        row = source.sidecar_row(source.places[cut.episode].episode_index)
         row.setdefault("source", source.root.name)
         robot = row.get("robot_digest")
         if not self._plan.keeps_scene(cut):
@@ -97,26 +73,12 @@ class SidecarReader:
             row["episode_info"] = _reworded(row["episode_info"], cut.task, source.root)
         if not cut.has_end:  # an outcome is unknown for a part of an episode
             row["success"] = None
-        return EpisodeRecord(
-            row=row,
-            moving_cameras=self._camera_poses(cut, index),
-            robot=None if robot is None else source.robot(str(robot)),
-        )
-
-    def _camera_poses(self, cut: EpisodeSlice, episode_index: int) -> dict[str, Array]:
-        """Camera -> (T, 7) world_from_camera; empty if unknown. Raises ExportError if frames are missing."""
-        rows = self._poses.frames(episode_index, cut.first, cut.last)
-        if rows is None or not rows.num_rows:
-            return {}
-        if rows.num_rows != cut.last - cut.first:
-            raise ExportError(f"Poses of cameras are missing in episode {episode_index}: {self._source.root}")
-        names = [name for name in rows.column_names if name not in _COUNTERS]
-        return {name: column_numbers(rows.column(name).combine_chunks()) for name in names}
+        return EpisodeRecord(row=row, robot=None if robot is None else source.robot(str(robot)))
 
 
 def kept_configs(plan: Plan) -> dict[str, Any] | None:
     """Return config digest -> configuration, of all sources; None if no source has a sidecar."""
-    if not any(source.sidecar_tables("episodes") for source in plan.sources):
+    if not any(source.sidecar_tables for source in plan.sources):
         return None
     configs: dict[str, Any] = {}
     for source in plan.sources:
@@ -184,7 +146,7 @@ def _other_files(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
     """Yield (name, reason) of the files of a source that are not written anew: copied ones, and those left out."""
     source = plan.sources[number]
     cameras = {mapping.feature for mapping in plan.mappings[number].values()}
-    keeps_poses, keeps_progress = _poses_are_kept(plan), has_progress(plan)
+    keeps_progress = has_progress(plan)
     used = {place.data for place in source.places}
     used |= {path for place in source.places for path, _ in place.videos.values()}
     for path in sorted(source.root.rglob("*")):
@@ -200,8 +162,6 @@ def _other_files(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
             yield name, _COPIED if is_same else "not the same in all datasets: copy it if it still applies"
         elif name.startswith(("data/", "videos/", "images/")):
             yield name, "no episode of the dataset is in this file"
-        elif name.startswith(f"{SIDECAR_DIR}/camera_poses/") and not keeps_poses:
-            yield name, "the other datasets have other moving cameras"
         elif name.startswith(f"{BOXES_DIR}/") and path.stem not in cameras:
             yield name, "its camera is left out"
         elif name in (PROGRESS_PATH, PROPORTIONS_PATH) and not keeps_progress:

@@ -23,7 +23,7 @@ from demorec.datasets.lerobot.inspect import episode_statistics
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, language_arrays, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.mp4 import EncodedVideo
-from demorec.datasets.lerobot.rows import IndexedRows
+from demorec.datasets.lerobot.rows import EpisodeTable
 from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, colour_levels
 from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.datasets.lerobot.writer import DatasetStart, DatasetWriter, EpisodeData
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from demorec.mcap.video import Rgb
 
 _NUMBERS = tuple(name for name in NAMES if name != "count")
-_EPISODES_AT_ONCE = 64
 _STAGE_PARTS = ("names", "start_frames", "end_frames", "start_times", "end_times")
 _OF_THE_END = ("next.done", "next.success", "next.reward")
 
@@ -101,12 +100,11 @@ class _Reader:
         self._rows = self.source.rows([*self._names, "task_index", "timestamp"])
         self._references = reference_columns(info)
         self._task_numbers = plan.task_numbers(number)
-        schema = pa.schema([("episode_index", pa.int64()), *self.source.fact_types.items()])
         tables = self.source.episode_tables if self.source.fact_types else ()
-        self._fact_rows = IndexedRows(tables, schema, rows=_EPISODES_AT_ONCE)
+        self._fact_rows = EpisodeTable(tables, pa.schema(list(self.source.fact_types.items())))
         self._known = {} if decode or not self.source.keeps_statistics else _kept_statistics(self.source)
         self._sidecar = SidecarReader(plan, number)
-        self._has_sidecar = any(source.sidecar_tables("episodes") for source in plan.sources)
+        self._has_sidecar = any(source.sidecar_tables for source in plan.sources)
 
     def episode(self, cut: EpisodeSlice) -> EpisodeData:
         """Read an episode."""
@@ -241,8 +239,7 @@ class _Reader:
         return EpisodeLanguage(persistent=[*latest.values(), *kept], events=spoken.events)
 
     def _facts(self, cut: EpisodeSlice, place: EpisodePlace) -> dict[str, Any]:
-        table = self._fact_rows.read(place.episode_index)
-        facts: dict[str, Any] = {} if table is None else table.drop_columns("episode_index").to_pylist()[-1]
+        facts = self._fact_rows.row(place.episode_index)
         if "duration_s" in facts:
             facts["duration_s"] = (cut.last - cut.first) / self._fps
         if "success" in facts and not cut.has_end:
