@@ -17,9 +17,6 @@ from demorec.episode.info import EpisodeInfo
 if TYPE_CHECKING:
     from demorec.mcap.video import Rgb, VideoPacket, VideoSettings
 
-Box = tuple[int, str, tuple[float, float, float, float]]
-"""Frame, name, and x, y, width and height in pixels, of an object in a camera's image."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneMotion:
@@ -110,7 +107,3 @@ class Episode(Protocol):
     def segment_names(self) -> Mapping[int, str]:
         """Read the names of the segments: number -> name."""
         return {}
-
-    def boxes(self, camera: str) -> Iterator[Box]:
-        """Yield the boxes in a camera's images, frame by frame."""
-        return iter(())

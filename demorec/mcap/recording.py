@@ -20,7 +20,7 @@ from demorec.core.files import Closing
 from demorec.core.plain import to_json, to_plain
 from demorec.episode.episode import NO_IMAGE, CameraImages, Event, Frame, JointSample, Table, Trajectory
 from demorec.episode.info import DEPTH_UNITS, NOT_SIMULATED, EpisodeInfo
-from demorec.episode.protocol import Box, SceneMotion
+from demorec.episode.protocol import SceneMotion
 from demorec.episode.simulated import simulated_table
 from demorec.episode.validity import find_problems
 from demorec.mcap import channels, messages, metadata
@@ -366,10 +366,6 @@ class Recording(Closing):
             values = from_labels(np.array(list(names), dtype=np.uint16)).tolist()
             return dict(zip(values, names.values(), strict=True))
         return {}
-
-    def boxes(self, camera: str) -> Iterator[Box]:
-        """Yield nothing: recordings have no boxes."""
-        return iter(())
 
     def _shown(self, camera: str) -> NDArray[np.int64]:
         """Return (T,) number of the camera's image at each frame."""

@@ -27,7 +27,6 @@ def log_cameras(recording: rr.RecordingStream, episode: Playback) -> None:
     if episode.scene is not None:
         _log_calibrations(recording, episode, episode.scene)
         _log_segmentations(recording, episode)
-    _log_boxes(recording, episode)
     for name in episode.cameras:
         if name in episode.videos:
             _send_video(recording, Paths.camera(name), episode, name)
@@ -102,23 +101,3 @@ def _log_segmentations(recording: rr.RecordingStream, episode: Playback) -> None
         colors = segment_colors(names.values())
         labels = [rr.AnnotationInfo(number, name, colors[name]) for number, name in names.items()]
         recording.log(Paths.world, rr.AnnotationContext(labels), static=True)
-
-
-def _log_boxes(recording: rr.RecordingStream, episode: Playback) -> None:
-    """Log boxes around visible bodies, named on hovering (names hide images)."""
-    found = {camera: list(episode.data.boxes(camera)) for camera in episode.data.cameras}
-    colors = segment_colors(sorted({name for boxes in found.values() for _, name, _ in boxes}))
-    for camera, boxes in found.items():
-        if not boxes:
-            continue
-        recording.log(Paths.camera(camera, "/boxes"), rr.Boxes2D.from_fields(show_labels=False), static=True)
-        columns = rr.Boxes2D.columns(
-            half_sizes=[(width / 2, height / 2) for _, _, (_, _, width, height) in boxes],
-            centers=[(x + width / 2, y + height / 2) for _, _, (x, y, width, height) in boxes],
-            labels=[name for _, name, _ in boxes],
-            colors=[colors[name] for _, name, _ in boxes],
-        )
-        lengths = np.bincount([frame for frame, _, _ in boxes], minlength=episode.num_frames)
-        recording.send_columns(
-            Paths.camera(camera, "/boxes"), indexes(episode.time_ns, episode.time_ns), columns.partition(lengths)
-        )

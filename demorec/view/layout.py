@@ -25,7 +25,7 @@ _PLOTS: Mapping[str, tuple[str, ...]] = {
 }
 """Title -> curves of a simulated episode; those of `_SIDE` are next to the tabs of the others. Any other curve has a
 separate plot: those of sensors in further tabs, the features of other episodes next to each other."""
-_NOT_IN_3D: tuple[Literal["/depth", "/segmentation", "/boxes"], ...] = ("/depth", "/segmentation", "/boxes")
+_NOT_IN_3D: tuple[Literal["/depth", "/segmentation"], ...] = ("/depth", "/segmentation")
 _FLOOR = 3.0
 """Minimum width, metres, of a body that counts as the floor, which would only hide the grid."""
 
@@ -113,15 +113,12 @@ def _eye(episode: Playback) -> rrb.EyeControls3D | None:
 def _camera_views(episode: Playback) -> list[rrb.View | rrb.Container]:
     views: list[rrb.View | rrb.Container] = []
     for name in episode.cameras:
-        is_recorded = name in episode.data.cameras
-        boxes = [Paths.camera(name, "/boxes")] if is_recorded and any(episode.data.boxes(name)) else []
         tabs: list[rrb.View] = []
         if name in episode.videos:
-            contents = ["$origin", *boxes]
-            tabs.append(rrb.Spatial2DView(origin=Paths.camera(name), contents=contents, name=f"{name} camera"))
+            tabs.append(rrb.Spatial2DView(origin=Paths.camera(name), contents=["$origin"], name=f"{name} camera"))
         if name in episode.depth:
             tabs.append(rrb.Spatial2DView(origin=Paths.camera(name, "/depth"), name=f"{name} depth"))
-        if is_recorded and episode.data.has_segmentation(name):
+        if name in episode.data.cameras and episode.data.has_segmentation(name):
             tabs.append(rrb.Spatial2DView(origin=Paths.camera(name, "/segmentation"), name=f"{name} segments"))
         if tabs:
             views.append(tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0))

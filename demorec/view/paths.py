@@ -47,8 +47,8 @@ class Paths:
         return f"/world/ends/{name}"
 
     @staticmethod
-    def camera(name: str, more: Literal["", "/depth", "/segmentation", "/boxes"] = "") -> str:
-        """Path of a camera's pose, pinhole and images; or of its other images, or boxes around visible bodies."""
+    def camera(name: str, more: Literal["", "/depth", "/segmentation"] = "") -> str:
+        """Path of a camera's pose, pinhole and images; or of its other images."""
         return f"/world/cameras/{name}{more}"
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""Bounding boxes in datasets and in playback match the segmentation images."""
+"""Bounding boxes in datasets match the segmentation images; playback shows the words of a dataset."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_boxes_need_segmentation_and_a_whole_dataset(tmp_path: Path) -> None:
         export(run, tmp_path / "told", boxes=True, append=True)
 
 
-def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> None:
+def test_playback_has_the_words(dataset: Path, tmp_path: Path) -> None:
     from rerun.chunk import RrdReader
 
     from demorec.view.from_dataset import open_dataset_episode
@@ -89,18 +89,12 @@ def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> 
         shown = {frame: text for frame, kind, text in episode.statements if kind == "subtask"}
         assert [frame / episode.info.fps for frame in shown] == pytest.approx(list(subtasks), abs=1e-3)
         assert list(shown.values()) == list(subtasks.values())
-        assert all(any(episode.data.boxes(camera)) for camera in ("front", "wrist"))
     save(find_episodes([dataset])[0], tmp_path / "x.rrd")
     pages: list[str] = []
-    counts: list[int] = []
     for chunk in RrdReader(tmp_path / "x.rrd").stream():
         batch = chunk.to_record_batch()
         if chunk.entity_path == "/words":
             pages += [page[0] for page in batch.column("TextDocument:text").to_pylist()]
-        if chunk.entity_path == "/world/cameras/front/boxes" and not chunk.is_static:
-            counts += [len(boxes or ()) for boxes in batch.column("Boxes2D:half_sizes").to_pylist()]
     assert len(pages) == len(subtasks)
     assert all(text in page for text, page in zip(subtasks.values(), pages, strict=True))
     assert pages[-1].endswith("on the green target.")
-    told = json.loads((dataset / "demorec" / "boxes" / f"{PREFIX}front.json").read_text())
-    assert counts == [sum(item["image_id"] == frame for item in told["annotations"]) for frame in range(len(frames))]

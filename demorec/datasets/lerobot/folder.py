@@ -40,7 +40,6 @@ from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
 
 # Code for videos, images, robots and the sidecar takes longer to load than most datasets' numbers to read.
 if TYPE_CHECKING:
-    from demorec.datasets.lerobot.boxes import StoredBoxes
     from demorec.datasets.lerobot.robots import DatasetRobot
     from demorec.datasets.lerobot.rows import StoredImages
     from demorec.datasets.lerobot.videos import EpisodeVideo, VideoFile
@@ -71,7 +70,6 @@ class LeRobotFolder:
         keeps_statistics: Whether edits keep the stored statistics of images.
         camera: Describes a camera from its first readable file or image.
         robot: Reads the arm with a digest.
-        boxes: Opens the boxes of a camera feature; None if the dataset has none.
 
     Raises:
         ConfigError: The dataset has no state from these servos.
@@ -98,7 +96,6 @@ class LeRobotFolder:
         self.open_video = lru_cache(maxsize=_MAX_OPEN_VIDEOS)(self._video_file)
         self.camera = cache(self._camera)
         self.robot = cache(self._robot)
-        self.boxes = cache(self._stored_boxes)
 
     def _video_file(self, path: Path) -> VideoFile:
         from demorec.datasets.lerobot.videos import VideoFile
@@ -311,12 +308,6 @@ class LeRobotFolder:
             there = [name for name in ("episode_index", *names) if name in stored]
             found += [dict.fromkeys(names) | row for row in read_table(path, there, schema=EPISODE_SCHEMA).to_pylist()]
         return found
-
-    def _stored_boxes(self, key: str) -> StoredBoxes | None:
-        from demorec.datasets.lerobot.boxes import BOXES_DIR, StoredBoxes
-
-        path = self.root / BOXES_DIR / f"{key}.json"
-        return StoredBoxes(path, [place.from_index for place in self.places]) if path.is_file() else None
 
     @cached_property
     def fact_types(self) -> Mapping[str, pa.DataType]:

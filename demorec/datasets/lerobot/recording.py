@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
-from demorec.datasets.lerobot.boxes import Box
 from demorec.datasets.lerobot.episode_places import are_on_grid
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
@@ -52,7 +51,7 @@ class DatasetRecording(Episode):
 
     def __init__(self, dataset: LeRobotFolder, number: int) -> None:
         self.place = place = dataset.places[number]
-        self.path, self.dataset, self._number = dataset.root, dataset, number
+        self.path, self.dataset = dataset.root, dataset
         self.num_frames = place.length
         self.known: Mapping[str, Any] = dataset.known.get(place.episode_index, {})
         self._is_depth = {name: dataset.info.features[key].is_depth for name, key in dataset.keys.items()}
@@ -273,11 +272,6 @@ class DatasetRecording(Episode):
             else:
                 texts[round(frame)] = text
         return texts, left_out
-
-    def boxes(self, camera: str) -> Iterator[Box]:
-        """Visible objects of a camera, frame by frame, from the dataset's boxes."""
-        stored = self.dataset.boxes(self.dataset.keys[camera])
-        return iter(()) if stored is None else stored.drawn(self._number, self.num_frames)
 
 
 def with_robot(info: EpisodeInfo, robot: DatasetRobot, roles: Roles) -> EpisodeInfo:

@@ -1,6 +1,6 @@
 """Files next to an edited dataset's tables, and the data of its sources that it omits.
 
-These are the sidecar's rows, robots, boxes and progress. Omissions are known before anything is
+These are the sidecar's rows, robots and progress. Omissions are known before anything is
 written.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.plain import listed, parse_json, to_json
-from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera
+from demorec.datasets.lerobot.boxes import BOXES_DIR
 from demorec.datasets.lerobot.dataset_features import MODALITY_PATH
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS
 from demorec.datasets.lerobot.files import open_table, read_json
@@ -40,40 +40,20 @@ def has_progress(plan: Plan) -> bool:
     return have_stages and has_files
 
 
-class SidecarReader:
-    """Files next to one source's tables, for the episodes of a plan.
-
-    Args:
-        plan: The new dataset.
-        number: Index of the source.
-
-    Methods raise ExportError if the files cannot be read.
-    """
-
-    def __init__(self, plan: Plan, number: int) -> None:
-        self._plan, self._source = plan, plan.sources[number]
-        found = {name: self._source.boxes(mapping.feature) for name, mapping in plan.mappings[number].items()}
-        self._boxes = {name: boxes for name, boxes in found.items() if boxes is not None}
-
-    def boxes(self, cut: EpisodeSlice) -> dict[str, SeenByCamera]:
-        """Return camera feature -> visible objects of an episode."""
-        found = {name: file.read(cut.episode, cut.first, cut.last) for name, file in self._boxes.items()}
-        return {name: seen for name, seen in found.items() if seen is not None}
-
-    def record(self, cut: EpisodeSlice) -> EpisodeRecord:
-        """Return the sidecar's data about an episode."""
-        source = self._source
-        row = source.sidecar_row(source.places[cut.episode].episode_index)
-        row.setdefault("source", source.root.name)
-        robot = row.get("robot_digest")
-        if not self._plan.keeps_scene(cut):
-            row |= dict.fromkeys(_OF_SCENE)
-            row["phases"] = _cut_phases(row, cut)
-        elif cut.task and row.get("episode_info") is not None:
-            row["episode_info"] = _reworded(row["episode_info"], cut.task, source.root)
-        if not cut.has_end:  # an outcome is unknown for a part of an episode
-            row["success"] = None
-        return EpisodeRecord(row=row, robot=None if robot is None else source.robot(str(robot)))
+def sidecar_record(plan: Plan, cut: EpisodeSlice) -> EpisodeRecord:
+    """Return the sidecar's data about an episode of a plan. Raises ExportError if it cannot be read."""
+    source = plan.sources[cut.source]
+    row = source.sidecar_row(source.places[cut.episode].episode_index)
+    row.setdefault("source", source.root.name)
+    robot = row.get("robot_digest")
+    if not plan.keeps_scene(cut):
+        row |= dict.fromkeys(_OF_SCENE)
+        row["phases"] = _cut_phases(row, cut)
+    elif cut.task and row.get("episode_info") is not None:
+        row["episode_info"] = _reworded(row["episode_info"], cut.task, source.root)
+    if not cut.has_end:  # an outcome is unknown for a part of an episode
+        row["success"] = None
+    return EpisodeRecord(row=row, robot=None if robot is None else source.robot(str(robot)))
 
 
 def kept_configs(plan: Plan) -> dict[str, Any] | None:
@@ -145,7 +125,6 @@ def _columns(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
 def _other_files(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
     """Yield (name, reason) of the files of a source that are not written anew: copied ones, and those left out."""
     source = plan.sources[number]
-    cameras = {mapping.feature for mapping in plan.mappings[number].values()}
     keeps_progress = has_progress(plan)
     used = {place.data for place in source.places}
     used |= {path for place in source.places for path, _ in place.videos.values()}
@@ -162,9 +141,7 @@ def _other_files(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
             yield name, _COPIED if is_same else "not the same in all datasets: copy it if it still applies"
         elif name.startswith(("data/", "videos/", "images/")):
             yield name, "no episode of the dataset is in this file"
-        elif name.startswith(f"{BOXES_DIR}/") and path.stem not in cameras:
-            yield name, "its camera is left out"
-        elif name in (PROGRESS_PATH, PROPORTIONS_PATH) and not keeps_progress:
+        elif name.startswith(f"{BOXES_DIR}/") or (name in (PROGRESS_PATH, PROPORTIONS_PATH) and not keeps_progress):
             yield name, "its values hold for the episodes of the source"
 
 

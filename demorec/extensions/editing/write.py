@@ -28,13 +28,7 @@ from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, co
 from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.datasets.lerobot.writer import DatasetStart, DatasetWriter, EpisodeData
 from demorec.datasets.options import ProgressCallback
-from demorec.extensions.editing.beside import (
-    SidecarReader,
-    copied_files,
-    has_progress,
-    kept_configs,
-    kept_export,
-)
+from demorec.extensions.editing.beside import copied_files, has_progress, kept_configs, kept_export, sidecar_record
 from demorec.extensions.editing.plan import EpisodeSlice, FeatureMapping, Plan, reference_columns
 
 if TYPE_CHECKING:
@@ -103,7 +97,6 @@ class _Reader:
         tables = self.source.episode_tables if self.source.fact_types else ()
         self._fact_rows = EpisodeTable(tables, pa.schema(list(self.source.fact_types.items())))
         self._known = {} if decode or not self.source.keeps_statistics else _kept_statistics(self.source)
-        self._sidecar = SidecarReader(plan, number)
         self._has_sidecar = any(source.sidecar_tables for source in plan.sources)
 
     def episode(self, cut: EpisodeSlice) -> EpisodeData:
@@ -155,8 +148,7 @@ class _Reader:
             row_tasks=tasks if len(set(tasks)) > 1 else (),
             annotated_tasks=[task for task in place.tasks if task in annotated],
             timestamps=self._timestamps(rows, cut),
-            record=self._sidecar.record(cut) if self._has_sidecar else None,
-            boxes=self._sidecar.boxes(cut),
+            record=sidecar_record(self._plan, cut) if self._has_sidecar else None,
         )
 
     def _renumbered(self, values: NDArray[np.int64]) -> NDArray[np.int64]:
