@@ -71,7 +71,7 @@ def test_boxes_need_segmentation_and_a_whole_dataset(tmp_path: Path) -> None:
     export(run, tmp_path / "told", language=())
     with pytest.raises(ConfigError, match="need recordings with segmentation"):
         export(run, tmp_path / "boxed", boxes=True)
-    with pytest.raises(ConfigError, match="--boxes are written for a whole dataset"):
+    with pytest.raises(ConfigError, match="--boxes is written for a whole dataset"):
         export(run, tmp_path / "told", boxes=True, append=True)
 
 

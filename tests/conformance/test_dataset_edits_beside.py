@@ -41,12 +41,13 @@ def failing(root: Path) -> set[str]:
 
 
 @pytest.mark.slow
-def test_rows_follow_their_episodes_and_boxes_are_named(
+def test_rows_follow_their_episodes_and_boxes_and_progress_are_named(
     simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     edit("reorder", simulated, "--order", "2,0,1", "--out", tmp_path / "r")
     printed = capsys.readouterr().out
     assert BOXES in printed
+    assert "sarm_progress.parquet" in printed
     assert "(its values hold for the episodes of the source)" in printed
     edit("select", tmp_path / "r", "--episodes", "0,2", "--out", tmp_path / "s")
     edit("trim", tmp_path / "s", "--head", 3, "--tail", 2, "--out", tmp_path / "t")

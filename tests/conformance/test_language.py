@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,6 +16,7 @@ from support.language import active, language_of, meant, phrases, scene_at
 
 from demorec.annotate import KINDS
 from demorec.annotate.referring import place_of
+from demorec.annotate.timeline import StageRun, dense_runs, dense_stages, episode_timeline, proportions
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS
@@ -257,6 +257,11 @@ def test_objects_have_the_names_of_the_instructions(kind: str) -> None:
         assert nouns_of(body)[0] == THINGS[kind].noun
 
 
+def stages_of(run: Path) -> list[StageRun]:
+    with _recording(run) as recording:
+        return dense_runs(episode_timeline(recording), np.arange(recording.num_frames))
+
+
 def test_progress_is_lerobots_own_over_the_true_stages(runs: list[Path], dataset: Path) -> None:
     from lerobot.rewards.sarm.sarm_utils import find_stage_and_tau, normalize_stage_tau
 
@@ -264,11 +269,13 @@ def test_progress_is_lerobots_own_over_the_true_stages(runs: list[Path], dataset
     rows = episode_rows(dataset)
     assert table["index"] == list(range(sum(row["length"] for row in rows)))
     assert table["episode_index"] == data_table(dataset).column("episode_index").to_pylist()
-    share = json.loads((dataset / "meta" / "temporal_proportions_dense.json").read_text())
     found = np.array(table["progress_dense"])
     assert 0 <= found.min() <= found.max() <= 1
-    for row, run in zip(rows, runs, strict=True):
-        names, starts, ends = (row[f"dense_subtask_{part}"] for part in ("names", "start_frames", "end_frames"))
+    episodes = [stages_of(run) for run in runs]
+    possible = [dense_stages(row["num_goals"], each) for row, each in zip(rows, episodes, strict=True)]
+    share = proportions(episodes, tuple(dict.fromkeys(itertools.chain.from_iterable(possible))))
+    for row, run, stage_runs in zip(rows, runs, episodes, strict=True):
+        names, starts, ends = (list(column) for column in zip(*stage_runs, strict=True))
         assert starts == [0, *(end + 1 for end in ends[:-1])]
         assert ends[-1] == row["length"] - 1
         own = found[row["dataset_from_index"] : row["dataset_to_index"]]
@@ -291,7 +298,7 @@ def test_progress_is_lerobots_own_over_the_true_stages(runs: list[Path], dataset
         assert falls.tolist() == (np.flatnonzero(misses)[-1:].tolist() if misses.any() else [])
 
 
-def test_sample_weighting_gives_no_weight_to_a_miss(dataset: Path) -> None:
+def test_sample_weighting_gives_no_weight_to_a_miss(runs: list[Path], dataset: Path) -> None:
     import torch
     from lerobot.rewards.sarm.rabc import RABCWeights
     from lerobot.utils.sample_weighting import SampleWeightingConfig, make_sample_weighter
@@ -300,8 +307,9 @@ def test_sample_weighting_gives_no_weight_to_a_miss(dataset: Path) -> None:
     config = SampleWeightingConfig(head_mode="dense")
     weighter = make_sample_weighter(config, policy, torch.device("cpu"), dataset_root=str(dataset))
     assert isinstance(weighter, RABCWeights)
-    row = next(row for row in episode_rows(dataset) if row["has_deliberate_miss"])
-    missed = row["dense_subtask_end_frames"][2]  # the last frame of the missed grasp
+    pairs = zip(episode_rows(dataset), runs, strict=True)
+    row, run = next((row, run) for row, run in pairs if row["has_deliberate_miss"])
+    missed = stages_of(run)[2].last  # the last frame of the missed grasp
     frames = torch.arange(row["dataset_from_index"], row["dataset_from_index"] + missed + 20)
     weights, _ = weighter.compute_batch_weights({"index": frames})
     assert (weights[missed - 8 : missed + 1] == 0).all()
@@ -332,14 +340,10 @@ def test_episodes_are_filtered_by_facts(runs: list[Path], dataset: Path) -> None
         assert (row["object_x"], row["object_y"]) == tuple(body.world_from_body.position[:2])
 
 
-def test_progress_continues_at_the_end_of_a_dataset(runs: list[Path], tmp_path: Path) -> None:
+def test_progress_needs_a_whole_dataset(runs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "grown"
     export(runs[0], out, progress=True)
-    with pytest.raises(ConfigError, match="has the stages of --progress: export with it"):
+    with pytest.raises(ConfigError, match="--progress is written for a whole dataset"):
+        export(runs[1], out, append=True, progress=True)
+    with pytest.raises(ConfigError, match="has no progress of new episodes"):
         export(runs[1], out, append=True)
-    export(runs[1], out, append=True, progress=True)
-    export(runs[:2], tmp_path / "at_once", progress=True)
-    assert (out / "sarm_progress.parquet").read_bytes() == (tmp_path / "at_once" / "sarm_progress.parquet").read_bytes()
-    export(runs[0], tmp_path / "plain")
-    with pytest.raises(ConfigError, match="lacks the stages of --progress: export without it"):
-        export(runs[1], tmp_path / "plain", append=True, progress=True)

@@ -15,7 +15,7 @@ from typing import Any
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.core.replacing import files_below
-from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH
+from demorec.datasets.lerobot.facts import PROGRESS_PATH
 from demorec.datasets.lerobot.files import open_table, read_json, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import (
@@ -36,7 +36,7 @@ _CONVERT = "demorec dataset select {} --where 'num_frames > 0' --out NEW"
 
 def start_after(folder: LeRobotFolder) -> DatasetStart:
     """Read the state that a writer needs to continue a dataset. Raises ExportError if it has another format, or is
-    incomplete.
+    incomplete, and ConfigError if it has progress.
     """
     root, info = folder.root, folder.info
     if info.is_old:
@@ -44,6 +44,8 @@ def start_after(folder: LeRobotFolder) -> DatasetStart:
             f"The dataset has format {info.version}, and only {CODEBASE_VERSION} can be appended to. This converts it "
             f"to {CODEBASE_VERSION}: {_CONVERT.format(shlex.quote(str(root)))}"
         )
+    if (root / PROGRESS_PATH).exists():
+        raise ConfigError(f"{PROGRESS_PATH} has no progress of new episodes: remove it, or export all again: {root}")
     episodes, frames = len(folder.places), sum(place.length for place in folder.places)
     rows = sum(open_table(path).metadata.num_rows for path in tables_in(root, "data"))
     if rows != frames:
@@ -111,7 +113,7 @@ def link_files(source: Path, target: Path) -> None:
     """Link a dataset's finished tables and videos into another folder, or copy them if links are not possible. Only
     files that are never changed in place are linked; files that the writer replaces are left out.
     """
-    renewed = (INFO_PATH, STATS_PATH, TASKS_PATH, PROGRESS_PATH, PROPORTIONS_PATH)
+    renewed = (INFO_PATH, STATS_PATH, TASKS_PATH)
     for name in files_below(source):
         if name not in renewed:
             path, copy = source / name, target / name

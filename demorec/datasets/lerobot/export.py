@@ -19,7 +19,7 @@ from demorec.core.processes import available_cores, in_turn
 from demorec.core.replacing import shown
 from demorec.datasets.lerobot.card import has_own_card, write_card
 from demorec.datasets.lerobot.existing import features_to_append, link_files, start_after
-from demorec.datasets.lerobot.facts import STAGE_COLUMNS, fact_types, write_progress
+from demorec.datasets.lerobot.facts import EpisodeStages, fact_types, write_progress
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import CODEBASE_VERSION, combined_digest
@@ -89,6 +89,7 @@ class _Export:
         self._transcoded: dict[str, None] = {}
         self._digests: dict[Path, str] = {}
         self._silent: list[str] = []
+        self._stages: list[EpisodeStages] = []
         self._intake = Intake(found, options)
 
     def run(self, folder: Path, progress: ProgressCallback | None) -> ExportReport:
@@ -106,12 +107,14 @@ class _Export:
                 if self._options.language is not None and not episode.has_statements:
                     self._silent.append(path.name)
                 self._transcoded.update(dict.fromkeys(episode.transcoded))
+                if episode.stages is not None:
+                    self._stages.append(episode.stages)
             self._refuse_duplicates()
             self._refuse_silence()
             stated = {name: getattr(self._options, name) for name in _STATED_OPTIONS}
             finished = writer.finish({"demorec": version("demorec"), **stated, "language": list(self._options.spoken)})
         if self._options.progress:
-            write_progress(folder)
+            write_progress(folder, self._stages)
         write_card(folder, finished, self._options, first.meanings, is_transcoded=bool(self._transcoded))
         return ExportReport(
             path=folder,
@@ -139,12 +142,6 @@ class _Export:
         if existing is None or start is None:
             return DatasetStart(info=first.info, facts=fact_types(first.data.facts), configs={})
         self._left_out = features_to_append(existing.root, start.info, first.info)
-        has_progress = set(STAGE_COLUMNS) <= set(start.facts)
-        if has_progress != self._options.progress:
-            raise ConfigError(
-                f"These recordings cannot be appended, because the dataset {'has' if has_progress else 'lacks'} the "
-                f"stages of --progress: export {'with' if has_progress else 'without'} it: {existing.root}"
-            )
         return start
 
     def _episodes(self, folder: Path, progress: ProgressCallback | None) -> Iterator[tuple[Path, ExportedEpisode]]:

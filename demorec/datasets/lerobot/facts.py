@@ -1,84 +1,52 @@
-"""Facts about each episode in LeRobot's places: columns to filter by, progress and stages.
+"""Facts about each episode in LeRobot's places: columns to filter by, and progress.
 
 Facts are columns of the table that LeRobot filters episodes by (`episode_filter`). The first episode decides which
-columns exist, because all files of the table must share them; an episode without a value has null. Progress and stages
-are:
-
-- `sarm_progress.parquet`: `progress_dense` for every row of the dataset, by which
-  `lerobot-train --sample_weighting.type=rabc --sample_weighting.head_mode=dense` weights samples;
-- columns `dense_subtask_names`, `dense_subtask_start_frames` and `dense_subtask_end_frames` in the table of episodes,
-  for training SARM;
-- `meta/temporal_proportions_dense.json`: the stages' mean shares of the time.
+columns exist, because all files of the table must share them; an episode without a value has null. Progress is the
+column `progress_dense` of `sarm_progress.parquet` for every row of the dataset, by which
+`lerobot-train --sample_weighting.type=rabc --sample_weighting.head_mode=dense` weights samples.
 """
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain, pairwise
+from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
-from demorec.annotate.timeline import StageRun, dense_stages, progress, proportions
-from demorec.core.errors import ExportError, describe_error
-from demorec.datasets.lerobot.files import open_table, rows_in
+from demorec.annotate.timeline import StageRun, dense_runs, dense_stages, episode_timeline, progress, proportions
+from demorec.datasets.lerobot.files import open_table
 
 if TYPE_CHECKING:
     from demorec.episode.scene import Scene
     from demorec.mcap import Recording
 
 PROGRESS_PATH = "sarm_progress.parquet"
-PROPORTIONS_PATH = "meta/temporal_proportions_dense.json"
-STAGE_NAMES = "dense_subtask_names"
-STAGE_STARTS = "dense_subtask_start_frames"
-STAGE_ENDS = "dense_subtask_end_frames"
-STAGE_COLUMNS: dict[str, pa.DataType] = {
-    STAGE_NAMES: pa.list_(pa.string()),
-    STAGE_STARTS: pa.list_(pa.int64()),
-    STAGE_ENDS: pa.list_(pa.int64()),
-}
-"""Column of the table of episodes -> its type."""
 
 
-def stage_columns(runs: Sequence[StageRun]) -> dict[str, Any]:
-    """Return the entries of an episode's stages in the table of episodes."""
-    return {
-        STAGE_NAMES: [run.stage for run in runs],
-        STAGE_STARTS: [run.first for run in runs],
-        STAGE_ENDS: [run.last for run in runs],
-    }
+class EpisodeStages(NamedTuple):
+    """Stages of an episode of the dataset: those of its rows, and all stages of its task in order."""
+
+    runs: Sequence[StageRun]
+    possible: Sequence[str]
 
 
-def _stage_runs(row: Mapping[str, Any]) -> list[StageRun]:
-    """Inverse of `stage_columns`; ValueError, TypeError or KeyError for an invalid row."""
-    runs = [
-        StageRun(stage=str(name), first=int(first), last=int(last))
-        for name, first, last in zip(row[STAGE_NAMES], row[STAGE_STARTS], row[STAGE_ENDS], strict=True)
-    ]
-    if not runs or runs[0].first != 0 or any(b.first != a.last + 1 for a, b in pairwise(runs)):
-        raise ValueError("stages that leave gaps")
-    return runs
+def episode_stages(recording: Recording, rows: NDArray[np.intp]) -> EpisodeStages:
+    """Return the stages of a simulated episode, whose (T,) recorded frames `rows` are in the dataset."""
+    runs = dense_runs(episode_timeline(recording), rows)
+    return EpisodeStages(runs, dense_stages(len(recording.info.simulated.scene.goals), runs))
 
 
-def write_progress(root: Path) -> None:
-    """Write the files of progress from the stages in the dataset's table of episodes. Raises ExportError if they cannot
-    be read.
-    """
-    try:
-        rows = list(rows_in(root, "meta/episodes", [*STAGE_COLUMNS, "num_goals"]))
-        episodes = [_stage_runs(row) for row in rows]
-        stages = [dense_stages(int(row["num_goals"]), runs) for row, runs in zip(rows, episodes, strict=True)]
-    except (ValueError, TypeError, KeyError) as error:
-        raise ExportError(
-            f"The stages of the dataset's episodes cannot be used ({describe_error(error)}): {root}"
-        ) from error
-    shares = proportions(episodes, tuple(dict.fromkeys(chain.from_iterable(stages))))
-    parts = [progress(runs, possible, shares) for runs, possible in zip(episodes, stages, strict=True)]
+def write_progress(root: Path, episodes: Sequence[EpisodeStages]) -> None:
+    """Write the file of progress for all episodes of a new dataset."""
+    stages = dict.fromkeys(chain.from_iterable(episode.possible for episode in episodes))
+    shares = proportions([episode.runs for episode in episodes], tuple(stages))
+    parts = [progress(episode.runs, episode.possible, shares) for episode in episodes]
     lengths = [len(part) for part in parts]
     columns = {
         "index": np.arange(sum(lengths)),
@@ -87,7 +55,6 @@ def write_progress(root: Path) -> None:
         "progress_dense": np.concatenate(parts).astype(np.float32),
     }
     pq.write_table(pa.table(columns), root / PROGRESS_PATH, use_dictionary=["episode_index"])
-    (root / PROPORTIONS_PATH).write_text(json.dumps(shares, indent=2) + "\n")
 
 
 _TYPES: dict[str, pa.DataType] = {
@@ -95,7 +62,6 @@ _TYPES: dict[str, pa.DataType] = {
     **dict.fromkeys(("failure_phase", "failure_reason", "task_name", "split", "variation", "object"), pa.string()),
     **dict.fromkeys(("num_retries", "run_episode_index", "attempt", "num_goals"), pa.int64()),
     "seed": pa.uint64(),
-    **STAGE_COLUMNS,
 }
 _LEROBOT_COLUMN = re.compile(
     r"(episode_index|tasks|length|dataset_from_index|dataset_to_index)$|(stats|videos|data|meta)/"

@@ -38,7 +38,7 @@ class ExportOptions(CommonOptions):
     (subtask plan memory motion task_aug), or all that the recordings support.
     """
     progress: Rare[bool] = False
-    """Add the progress of each frame (0 to 1) and the stages of the task, for LeRobot's sample weighting and SARM."""
+    """Add the progress of each frame (0 to 1), for LeRobot's sample weighting."""
     boxes: Rare[bool] = False
     """Write bounding boxes of visible objects next to the dataset, in COCO's format (for recordings with
     segmentation).
@@ -81,10 +81,9 @@ class ExportOptions(CommonOptions):
             raise ConfigError("--append and --overwrite exclude each other: choose one.")
         if self.allow_duplicates and not self.append:
             raise ConfigError("--allow-duplicates belongs to --append.")
-        if self.append and self.boxes:
-            raise ConfigError(
-                "--boxes are written for a whole dataset: leave out --append and export the whole dataset again."
-            )
+        for name in ("boxes", "progress"):
+            if self.append and getattr(self, name):
+                raise ConfigError(f"--{name} is written for a whole dataset: leave out --append and export it again.")
         if self.workers < 0:
             raise OptionError("workers", f"is {self.workers}, allowed are 0 (as many as are useful) or more.")
         if self.state not in STATE_KINDS:

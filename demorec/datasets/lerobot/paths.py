@@ -22,7 +22,7 @@ def is_dataset(path: Path) -> bool:
 
 _NUMBERED = r"(file-\d+|episode_\d+)"
 _PARTS = re.compile(
-    r"meta/(info|stats|modality|temporal_proportions_dense)\.json"
+    r"meta/(info|stats|modality|temporal_proportions_\w+)\.json"
     r"|sarm_progress\.parquet"
     r"|meta/tasks\.parquet"
     r"|meta/(tasks|episodes|episodes_stats)\.jsonl"

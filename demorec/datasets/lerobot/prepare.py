@@ -13,13 +13,12 @@ import numpy as np
 from demorec.annotate import Statement
 from demorec.annotate.boxes import seen_objects
 from demorec.annotate.statements import episode_statements
-from demorec.annotate.timeline import dense_runs, episode_timeline
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.episode import DONE, REWARD, SCALARS, SUCCESS, ExportCamera, ExportEpisode
 from demorec.datasets.lerobot.boxes import SeenByCamera
 from demorec.datasets.lerobot.depth import depth_info, depth_video
-from demorec.datasets.lerobot.facts import episode_facts, stage_columns
+from demorec.datasets.lerobot.facts import EpisodeStages, episode_facts, episode_stages
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language, language_arrays
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -61,6 +60,7 @@ class ExportedEpisode:
         transcoded: Cameras with transcoded images, and the reason.
         has_statements: Whether it has any language.
         meanings: Feature -> its description in the recording.
+        stages: Its stages, for the progress; None unless requested.
     """
 
     data: EpisodeData
@@ -70,6 +70,7 @@ class ExportedEpisode:
     transcoded: tuple[str, ...]
     has_statements: bool
     meanings: Mapping[str, str]
+    stages: EpisodeStages | None
 
 
 def export_episode(recording: Recording, options: ExportOptions) -> LeRobotEpisode:
@@ -139,7 +140,7 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         videos=videos,
         video_info=video_infos,
         pixels=pixels,
-        facts=_facts(episode),
+        facts={} if episode.scene is None else episode_facts(recording),
         record=EpisodeRecord.of(episode),
         boxes=_episode_boxes(episode) if options.boxes else {},
     )
@@ -159,6 +160,7 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         transcoded=tuple(f"{camera.name}, {reason}" for camera, reason in reasons.items() if reason),
         has_statements=bool(language.persistent),
         meanings={feature.name: feature.source for feature in episode.info.features},
+        stages=episode_stages(recording, episode.rows) if options.progress else None,
     )
 
 
@@ -193,15 +195,6 @@ def language_of(episode: LeRobotEpisode) -> EpisodeLanguage:
     else:
         statements = episode_statements(recording, episode.rows, options.spoken)
     return episode_language(statements, fps=episode.fps)
-
-
-def _facts(episode: LeRobotEpisode) -> dict[str, Any]:
-    if episode.scene is None:
-        return {}
-    facts = episode_facts(episode.recording)
-    if episode.options.progress:
-        facts |= stage_columns(dense_runs(episode_timeline(episode.recording), episode.rows))
-    return facts
 
 
 def _episode_boxes(episode: LeRobotEpisode) -> dict[str, SeenByCamera]:

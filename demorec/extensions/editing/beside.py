@@ -1,7 +1,6 @@
 """Files next to an edited dataset's tables, and the data of its sources that it omits.
 
-These are the sidecar's rows, robots and progress. Omissions are known before anything is
-written.
+These are the sidecar's rows and robots. Omissions are known before anything is written.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.core.plain import listed, parse_json, to_json
 from demorec.datasets.lerobot.boxes import BOXES_DIR
 from demorec.datasets.lerobot.dataset_features import MODALITY_PATH
-from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS
+from demorec.datasets.lerobot.facts import PROGRESS_PATH
 from demorec.datasets.lerobot.files import open_table, read_json
 from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, SECOND_CARD_PATH, is_dataset_file
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH, EpisodeRecord
@@ -25,19 +24,13 @@ _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "epi
 """Columns that describe a simulated episode as recorded, and do not apply to a cut one."""
 _ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", MODALITY_PATH)
 """Files that are copied if all sources have the same."""
+_OF_ALL_ROWS = (f"{BOXES_DIR}/", PROGRESS_PATH, "meta/temporal_proportions_")
+"""Files, or beginnings of their names, with values of all rows of the source."""
 _OF_OTHER_TOOLS = (".cache/", ".git/")
 """Folders created by downloading a dataset."""
 _COPIED = "copied"
 MAX_NAMES = 5
 """Maximum files listed of one kind."""
-
-
-def has_progress(plan: Plan) -> bool:
-    """Whether all sources have progress and demorec's stages, from which that of the new dataset is computed."""
-    needed = {*STAGE_COLUMNS, "num_goals"}
-    have_stages = all(needed <= set(source.fact_types) for source in plan.sources)
-    has_files = all((source.root / PROGRESS_PATH).is_file() for source in plan.sources)
-    return have_stages and has_files
 
 
 def sidecar_record(plan: Plan, cut: EpisodeSlice) -> EpisodeRecord:
@@ -125,7 +118,6 @@ def _columns(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
 def _other_files(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
     """Yield (name, reason) of the files of a source that are not written anew: copied ones, and those left out."""
     source = plan.sources[number]
-    keeps_progress = has_progress(plan)
     used = {place.data for place in source.places}
     used |= {path for place in source.places for path, _ in place.videos.values()}
     for path in sorted(source.root.rglob("*")):
@@ -141,7 +133,7 @@ def _other_files(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
             yield name, _COPIED if is_same else "not the same in all datasets: copy it if it still applies"
         elif name.startswith(("data/", "videos/", "images/")):
             yield name, "no episode of the dataset is in this file"
-        elif name.startswith(f"{BOXES_DIR}/") or (name in (PROGRESS_PATH, PROPORTIONS_PATH) and not keeps_progress):
+        elif name.startswith(_OF_ALL_ROWS):
             yield name, "its values hold for the episodes of the source"
 
 

@@ -16,7 +16,6 @@ from PIL import Image
 from demorec.core.errors import ExportError
 from demorec.core.files import open_regular
 from demorec.datasets.lerobot.episode_places import EpisodePlace, are_on_grid
-from demorec.datasets.lerobot.facts import write_progress
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_statistics
@@ -28,7 +27,7 @@ from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, co
 from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.datasets.lerobot.writer import DatasetStart, DatasetWriter, EpisodeData
 from demorec.datasets.options import ProgressCallback
-from demorec.extensions.editing.beside import copied_files, has_progress, kept_configs, kept_export, sidecar_record
+from demorec.extensions.editing.beside import copied_files, kept_configs, kept_export, sidecar_record
 from demorec.extensions.editing.plan import EpisodeSlice, FeatureMapping, Plan, reference_columns
 
 if TYPE_CHECKING:
@@ -71,8 +70,6 @@ def write_plan(
             if progress is not None:
                 progress(done, len(plan.cuts))
         writer.finish(kept_export(plan))
-    if has_progress(plan):
-        write_progress(folder)
     for name in copied_files(plan):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         with open_regular(plan.sources[0].root / name) as source_file, (folder / name).open("wb") as target:
