@@ -23,7 +23,6 @@ from demorec.annotate.timeline import StageRun, dense_runs, dense_stages, episod
 from demorec.datasets.lerobot.files import open_table
 
 if TYPE_CHECKING:
-    from demorec.episode.scene import Scene
     from demorec.mcap import Recording
 
 PROGRESS_PATH = "sarm_progress.parquet"
@@ -59,7 +58,7 @@ def write_progress(root: Path, episodes: Sequence[EpisodeStages]) -> None:
 
 _TYPES: dict[str, pa.DataType] = {
     **dict.fromkeys(("success", "has_deliberate_miss"), pa.bool_()),
-    **dict.fromkeys(("failure_phase", "failure_reason", "task_name", "split", "variation", "object"), pa.string()),
+    **dict.fromkeys(("failure_phase", "failure_reason", "task_name", "split", "variation"), pa.string()),
     **dict.fromkeys(("num_retries", "run_episode_index", "attempt", "num_goals"), pa.int64()),
     "seed": pa.uint64(),
 }
@@ -82,7 +81,7 @@ def fact_columns(tables: Sequence[Path]) -> dict[str, pa.DataType]:
 
 
 def episode_facts(recording: Recording) -> dict[str, Any]:
-    """Return fact -> value for an episode with a scene; positions in the world frame at the start, metres."""
+    """Return fact -> value for an episode with a scene."""
     info, outcome, simulation = recording.info, recording.outcome, recording.info.simulated
     return {
         "success": outcome is not None and outcome.success,
@@ -98,19 +97,4 @@ def episode_facts(recording: Recording) -> dict[str, Any]:
         "run_episode_index": info.episode_index,
         "attempt": info.attempt,
         "num_goals": len(simulation.scene.goals),
-        **_first_goal(simulation.scene),
-    }
-
-
-def _first_goal(scene: Scene) -> dict[str, Any]:
-    if not scene.goals:
-        return {"object": "", "object_x": None, "object_y": None, "goal_x": None, "goal_y": None}
-    goal = scene.goals[0]
-    here, there = scene.body(goal.object).world_from_body.position, scene.world_from_goal(goal).position
-    return {
-        "object": goal.object,
-        "object_x": float(here[0]),
-        "object_y": float(here[1]),
-        "goal_x": float(there[0]),
-        "goal_y": float(there[1]),
     }
