@@ -9,7 +9,7 @@ column `progress_dense` of `sarm_progress.parquet` for every row of the dataset,
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -56,20 +56,25 @@ def write_progress(root: Path, episodes: Sequence[EpisodeStages]) -> None:
     pq.write_table(pa.table(columns), root / PROGRESS_PATH, use_dictionary=["episode_index"])
 
 
-_TYPES: dict[str, pa.DataType] = {
-    **dict.fromkeys(("success", "has_deliberate_miss"), pa.bool_()),
-    **dict.fromkeys(("failure_phase", "failure_reason", "task_name", "split", "variation"), pa.string()),
-    **dict.fromkeys(("num_retries", "run_episode_index", "attempt", "num_goals"), pa.int64()),
+FACTS: Mapping[str, pa.DataType] = {
+    "success": pa.bool_(),
+    "failure_phase": pa.string(),
+    "failure_reason": pa.string(),
+    "num_retries": pa.int64(),
+    "has_deliberate_miss": pa.bool_(),
+    "duration_s": pa.float64(),
+    "task_name": pa.string(),
+    "split": pa.string(),
+    "variation": pa.string(),
     "seed": pa.uint64(),
+    "run_episode_index": pa.int64(),
+    "attempt": pa.int64(),
+    "num_goals": pa.int64(),
 }
+"""Column of a simulated episode in the table of episodes -> its type."""
 _LEROBOT_COLUMN = re.compile(
     r"(episode_index|tasks|length|dataset_from_index|dataset_to_index)$|(stats|videos|data|meta)/"
 )
-
-
-def fact_types(names: Iterable[str]) -> dict[str, pa.DataType]:
-    """Return fact column -> type; facts that are not listed are numbers."""
-    return {name: _TYPES.get(name, pa.float64()) for name in names}
 
 
 def fact_columns(tables: Sequence[Path]) -> dict[str, pa.DataType]:
@@ -81,7 +86,7 @@ def fact_columns(tables: Sequence[Path]) -> dict[str, pa.DataType]:
 
 
 def episode_facts(recording: Recording) -> dict[str, Any]:
-    """Return fact -> value for an episode with a scene."""
+    """Return the value of each of `FACTS` for an episode with a scene."""
     info, outcome, simulation = recording.info, recording.outcome, recording.info.simulated
     return {
         "success": outcome is not None and outcome.success,

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.files import column_numbers, table_batches
+from demorec.datasets.lerobot.files import column_numbers, open_table, table_batches
 from demorec.datasets.lerobot.layout import DatasetFeature
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
@@ -163,86 +164,33 @@ def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
 _BATCH_ROWS = 2048
 
 
-def data_statistics(files: Iterable[Path], features: Mapping[str, DatasetFeature]) -> dict[str, Statistics]:
+def data_statistics(files: Sequence[Path], features: Mapping[str, DatasetFeature]) -> dict[str, Statistics]:
     """Feature -> statistics over all rows of Parquet files; for arrays of several dimensions along the last one, as in
     LeRobot. Raises ExportError if a numeric column holds values that are not numbers, or has no rows.
     """
-    paths = list(files)
-    groups: dict[int, dict[str, int]] = {}
-    for name, feature in features.items():
-        if feature.is_numeric:
-            groups.setdefault(math.prod(feature.shape[:-1]), {})[name] = feature.shape[-1]
-    found: dict[str, Statistics] = {}
-    for times, widths in groups.items():
-        found |= _group_statistics(paths, widths, times)
-    return found
+    numeric = {name: feature.shape for name, feature in features.items() if feature.is_numeric}
+    return {name: _stored_statistics(files, name, shape) for name, shape in numeric.items()}
 
 
-def _group_statistics(paths: Sequence[Path], widths: Mapping[str, int], times: int) -> dict[str, Statistics]:
-    """Statistics of features with `times` vectors per frame; `widths` maps names to D."""
-
-    def vectors() -> Iterator[Array]:
-        for arrays in _batches(paths, list(widths)):
-            if any(array.dtype.kind not in "fiub" for array in arrays):  # nulls, or lists of different lengths
-                raise ExportError("A column of the dataset holds values that are not numbers, so it has no statistics.")
-            blocks = [array.reshape(times * len(array), -1) for array in arrays]
-            yield np.concatenate(blocks, axis=1, dtype=np.float64)
-
-    count, values = _moments(vectors())
-    result = {}
-    start = 0
-    for name, width in widths.items():
-        part = {key: value[start : start + width] for key, value in values.items()}
-        part |= _quantiles(paths, name, (width, count))
-        result[name] = Statistics(values=part, count=count // times)
-        start += width
-    return result
-
-
-def _quantiles(paths: Sequence[Path], name: str, shape: tuple[int, int]) -> dict[str, Array]:
-    """Quantile -> (D,) of one feature of `shape` (D, T)."""
-    ranks = {key: quantile_ranks(q, shape[1]) for key, q in QUANTILES.items()}
-    wanted = sorted({rank for low, high, _ in ranks.values() for rank in (low, high)})
-    found = np.empty((shape[0], len(wanted)))
-    # One component at a time, in a file next to the data: /tmp may be in memory.
-    with tempfile.TemporaryFile(dir=paths[0].parent, buffering=0) as file:
-        start = 0
-        for (rows,) in _batches(paths, [name]):
-            array = rows.reshape(-1, shape[0])
-            for index, part in enumerate(array.T):
-                file.seek((index * shape[1] + start) * array.itemsize)
-                file.write(part.tobytes())
-            start += len(array)
-        file.seek(0)
-        for values in found:
-            values[:] = np.partition(np.fromfile(file, array.dtype, shape[1]), wanted)[wanted]
-    place = {rank: found[:, index] for index, rank in enumerate(wanted)}
-    return {key: place[low] + (place[high] - place[low]) * weight for key, (low, high, weight) in ranks.items()}
-
-
-def _batches(paths: Sequence[Path], names: list[str]) -> Iterator[list[NDArray[Any]]]:
-    for path in paths:
-        for batch in table_batches(path, names, rows=_BATCH_ROWS):
-            yield [column_numbers(batch.column(name)) for name in names]
-
-
-def _moments(parts: Iterable[Array]) -> tuple[int, dict[str, Array]]:
-    """Number of rows of arrays (T, D) that arrive in parts, and their minimum, maximum, mean and standard deviation.
-    Chan, Golub and LeVeque 1979.
-    """
-    count = 0
-    found: dict[str, Array] = {}
-    for values in parts:
-        rows, mean = len(values), values.mean(axis=0)
-        low, high, squares = values.min(axis=0), values.max(axis=0), ((values - mean) ** 2).sum(axis=0)
-        if count:
-            delta, total = mean - found["mean"], count + rows
-            squares = found["squares"] + squares + delta * delta * (count * rows / total)
-            mean = found["mean"] + delta * (rows / total)
-            low, high = np.minimum(found["min"], low), np.maximum(found["max"], high)
-        count += rows
-        found = {"min": low, "max": high, "mean": mean, "squares": squares}
-    if not count:
+def _stored_statistics(files: Sequence[Path], name: str, shape: tuple[int, ...]) -> Statistics:
+    """Statistics of one feature, from one element of all vectors at a time."""
+    rows = sum(open_table(path).metadata.num_rows for path in files)
+    if not rows:
         raise ExportError("The dataset has no rows, so it has no statistics.")
-    deviation = np.sqrt(found.pop("squares") / count)
-    return count, {**found, "std": deviation}
+    width, count = shape[-1], rows * math.prod(shape[:-1])
+    # In a file next to the data: /tmp may be in memory.
+    with tempfile.TemporaryFile(dir=files[0].parent, buffering=0) as file:
+        start = 0
+        for batch in chain.from_iterable(table_batches(path, [name], rows=_BATCH_ROWS) for path in files):
+            numbers = column_numbers(batch.column(name))
+            if numbers.dtype.kind not in "fiub":  # nulls, or lists of different lengths
+                raise ExportError("A column of the dataset holds values that are not numbers, so it has no statistics.")
+            vectors = numbers.reshape(-1, width).astype(np.float64)
+            for index, element in enumerate(vectors.T):
+                file.seek((index * count + start) * element.itemsize)
+                file.write(element.tobytes())
+            start += len(vectors)
+        file.seek(0)
+        elements = [vector_statistics({name: np.fromfile(file, np.float64, count)})[name] for _ in range(width)]
+    values = {key: np.concatenate([element.values[key] for element in elements]) for key in elements[0].values}
+    return Statistics(values=values, count=rows)
