@@ -8,19 +8,16 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from demorec.core.text import markdown
 from demorec.datasets.episode import DONE, INTERVENTION, REWARD, SUCCESS
 from demorec.datasets.lerobot.episode_places import read_tasks
-from demorec.datasets.lerobot.files import read_json, rows_in, write_text
+from demorec.datasets.lerobot.files import rows_in, write_text
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
+from demorec.datasets.lerobot.paths import CARD_PATH, SIDECAR_DIR
 from demorec.episode.features import (
     ACTION,
     COMMAND,
@@ -64,39 +61,15 @@ _ACTION_MEANING: Mapping[ActionKind, str] = {
     "ee_delta": "change of the tool centre point's pose since the frame before, the first since the observed one: "
     "translation (m) and rotation vector (rad) in base axes, applied from the left; gripper opening (m), absolute",
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Wording:
-    """Parts of a card that depend on the origin of the data; `{demonstrations}` and `{robot}` are filled in."""
-
-    licence: str
-    tags: str
-    content: str
-    made: str
-    packets: str
-    rows: str
-
-
-_SIMULATED = _Wording(
-    licence="apache-2.0",  # of data that demorec simulated, unless the user names another one
-    tags="- simulation\n",
-    content="scripted {demonstrations} by a simulated {robot} arm in PyBullet",
-    made="Recorded and exported by demorec",
-    packets="stored as recorded",
-    rows="Row t holds the observation at time t, taken before the action of row t is applied; the action is the "
-    "expert's target for the next frame. Where exploration noise was added to the motor commands, the action is "
-    "derived from the clean target. Frame times are multiples of the simulation's frame period, not of a wall clock.",
+_SIMULATED_ROWS = (
+    "Row t holds the observation at time t, taken before the action of row t is applied; the action is the expert's "
+    "target for the next frame. Where exploration noise was added to the motor commands, the action is derived from "
+    "the clean target. Frame times are multiples of the simulation's frame period, not of a wall clock."
 )
-_RECORDED = _Wording(
-    licence="",
-    tags="",
-    content="{demonstrations} of {robot}",
-    made="Exported by demorec",
-    packets="unchanged",
-    rows="Row t holds the data of frame t in the recordings; the table above has the origin of each feature. "
-    "LeRobot's timestamps are multiples of the nominal period; the recordings have the exact timestamps of the frames "
-    "and the age of each sample.",
+_RECORDED_ROWS = (
+    "Row t holds the data of frame t in the recordings; the table above has the origin of each feature. LeRobot's "
+    "timestamps are multiples of the nominal period; the recordings have the exact timestamps of the frames and the "
+    "age of each sample."
 )
 _CARD = """---
 {license}task_categories:
@@ -136,23 +109,16 @@ dataset = LeRobotDataset("{repo_id}", video_backend="pyav")
 
 `meta/info.json` names all elements. `demorec/` holds data without a column in LeRobot's format.
 """
-_AGAIN = """
-This command generates it again from this folder alone and compares every episode bit for bit:
-
-```sh
-generate-dataset --config path/of/this/folder --out copy
-```
-
-"""
 
 
-def write_card(
-    root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mapping[str, str], *, is_transcoded: bool
-) -> None:
-    """Write the card of a finished dataset folder; `meanings` has the features' descriptions in the recordings."""
-    path = root / (SECOND_CARD_PATH if has_own_card(root) else CARD_PATH)
-    path.unlink(missing_ok=True)
-    write_text(path, _marked(_card(root, info, options, meanings, is_transcoded=is_transcoded)))
+def write_card(root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mapping[str, str]) -> None:
+    """Write the card of a finished dataset folder, unless it has one of the user; `meanings` has the features'
+    descriptions in the recordings.
+    """
+    path = root / CARD_PATH
+    if not has_own_card(root):
+        path.unlink(missing_ok=True)  # a copy of the existing one may be read-only
+        write_text(path, _marked(_card(root, info, options, meanings)))
 
 
 def has_own_card(root: Path) -> bool:
@@ -170,15 +136,12 @@ def _marked(text: str) -> str:
     return text + _MARK.format(digest=hashlib.sha256(text.encode()).hexdigest()[:16])
 
 
-def _card(
-    root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mapping[str, str], *, is_transcoded: bool
-) -> str:
-    configs: Mapping[str, Any] = read_json(root / CONFIGS_PATH)  # empty if demorec simulated no episode
-    rows = list(rows_in(root, f"{SIDECAR_DIR}/episodes", ["root_seed", "origin"]))
-    # recordings of other robots have no seed
-    wording = _SIMULATED if configs and all(row["root_seed"] is not None for row in rows) else _RECORDED
+def _card(root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mapping[str, str]) -> str:
+    seeds = [row["root_seed"] for row in rows_in(root, f"{SIDECAR_DIR}/episodes", ["root_seed"])]
+    # recordings of other robots have no seed, episodes of other writers no row
+    is_simulated = None not in seeds and len(seeds) == info.total_episodes
     meaning = {**_MEANING, **{name: markdown(source) for name, source in meanings.items() if source}}
-    if wording is _SIMULATED:
+    if is_simulated:
         meaning |= {**_SIMULATED_MEANING, ACTION: _ACTION_MEANING[options.action]}
         if options.state == "joint_ee":
             meaning[STATE] = f"{meaning[STATE]}, {meaning[EE_POSE]}"
@@ -191,30 +154,26 @@ def _card(
     listed = [f"- {markdown(task)}" for task in tasks[:_MAX_TASKS]]
     if len(tasks) > _MAX_TASKS:
         listed.append(f"- and {len(tasks) - _MAX_TASKS} more")
-    licence = options.license or wording.licence
-    card = _CARD.format(
+    licence = options.license or ("apache-2.0" if is_simulated else "")
+    return _CARD.format(
         license=f"license: {licence}\n" if licence else "",
-        simulation=wording.tags,
+        simulation="- simulation\n" if is_simulated else "",
         repo_id=options.repo_id,
-        summary=_summary(info, wording, is_transcoded=is_transcoded),
+        summary=_summary(info, is_simulated=is_simulated),
         tasks="\n".join(listed),
         features="\n".join(features),
-        rows=wording.rows,
+        rows=_SIMULATED_ROWS if is_simulated else _RECORDED_ROWS,
     )
-    is_one_run = len(configs) == 1 and not options.append and not any(row["origin"] for row in rows)
-    return card + _AGAIN if is_one_run else card
 
 
-def _summary(info: DatasetInfo, wording: _Wording, *, is_transcoded: bool) -> str:
-    content = wording.content.format(
-        demonstrations="demonstration" if info.total_episodes == 1 else "demonstrations",
-        robot=markdown(str(info.robot_type)),
-    )
-    minutes = info.total_frames / info.fps / 60
-    images = "some images were encoded again" if is_transcoded else f"video packets are {wording.packets}"
+def _summary(info: DatasetInfo, *, is_simulated: bool) -> str:
+    demonstrations = "demonstration" if info.total_episodes == 1 else "demonstrations"
+    robot, minutes = markdown(str(info.robot_type)), info.total_frames / info.fps / 60
+    scripted = f"scripted {demonstrations} by a simulated {robot} arm in PyBullet"
+    content = scripted if is_simulated else f"{demonstrations} of {robot}"
     return (
         f"{info.total_episodes} {content}, {info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), "
-        f"in the LeRobot v3.0 format. {wording.made}; {images}."
+        "in the LeRobot v3.0 format. Exported by demorec."
     )
 
 

@@ -115,7 +115,7 @@ class _Export:
             finished = writer.finish({"demorec": version("demorec"), **stated, "language": list(self._options.spoken)})
         if self._options.progress:
             write_progress(folder, self._stages)
-        write_card(folder, finished, self._options, first.meanings, is_transcoded=bool(self._transcoded))
+        write_card(folder, finished, self._options, first.meanings)
         return ExportReport(
             path=folder,
             num_episodes=finished.total_episodes,

@@ -11,8 +11,6 @@ INFO_PATH = "meta/info.json"
 CARD_PATH = "README.md"
 SIDECAR_DIR = "demorec"
 """Folder inside the dataset for data without a place in LeRobot's format."""
-SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
-"""Path of the card if the dataset has a README.md that demorec did not write."""
 
 
 def is_dataset(path: Path) -> bool:
@@ -34,7 +32,7 @@ _PARTS = re.compile(
     rf"|{SIDECAR_DIR}/episodes/chunk-\d+/file-\d+\.parquet"
     rf"|{SIDECAR_DIR}/boxes/[^/]+\.json"
     rf"|{SIDECAR_DIR}/robots/[0-9a-f]{{16}}\.(json|urdf)"
-    rf"|{SIDECAR_DIR}/(configs\.json|export\.json|README\.md)"
+    rf"|{SIDECAR_DIR}/(configs|export)\.json"
     r"|README\.md|\.gitattributes|\.cache/huggingface/.*"
 )
 """Files of a dataset in LeRobot's formats 2.0 to 3.0, including demorec's, GR00T's and the Hub's."""

@@ -16,13 +16,13 @@ from demorec.datasets.lerobot.boxes import BOXES_DIR
 from demorec.datasets.lerobot.dataset_features import MODALITY_PATH
 from demorec.datasets.lerobot.facts import PROGRESS_PATH
 from demorec.datasets.lerobot.files import open_table, read_json
-from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, SECOND_CARD_PATH, is_dataset_file
+from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, is_dataset_file
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH, EpisodeRecord
 from demorec.extensions.editing.plan import EpisodeSlice, Plan
 
 _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "episode_info")
 """Columns that describe a simulated episode as recorded, and do not apply to a cut one."""
-_ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", MODALITY_PATH)
+_ABOUT_THE_WHOLE = (CARD_PATH, ".gitattributes", MODALITY_PATH)
 """Files that are copied if all sources have the same."""
 _OF_ALL_ROWS = (f"{BOXES_DIR}/", PROGRESS_PATH, "meta/temporal_proportions_")
 """Files, or beginnings of their names, with values of all rows of the source."""
