@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from support.check import checked, edit_json, verdict_of
 from support.docs import run_examples
-from support.export import data_table, episode_rows, export, make_run
+from support.export import data_table, episode_rows, export, export_in_files, make_run
 from support.recording import make_episode
 
 import demorec.datasets.lerobot.parquet
@@ -38,7 +38,7 @@ def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("dataset") / "d"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(demorec.datasets.lerobot.parquet, "_ROWS_PER_TABLE", 2)
-        export(run, out, privileged=True, video_files_mb=0.006, data_files_mb=0.03, files_per_chunk=2)
+        export_in_files(run, out, privileged=True, video_mb=0.006, data_mb=0.03, chunk=2)
     for folder in ("data", "meta/episodes", "videos/observation.images.front", "videos/observation.images.wrist"):
         assert len(list((out / folder).rglob("file-*"))) > 1, folder
     return out
@@ -228,7 +228,7 @@ def test_lerobot_continues_recording_and_then_demorec_appends(run: Path, tmp_pat
 
 @pytest.mark.slow
 def test_lerobot_doctor_finds_no_fault(run: Path, tmp_path: Path) -> None:
-    export(run, tmp_path / "d", video_files_mb=0.006, data_files_mb=0.03)
+    export_in_files(run, tmp_path / "d", video_mb=0.006, data_mb=0.03)
     text = lerobot_command("lerobot-doctor", "check", str(tmp_path / "d"), "--ci")
     report, _ = json.JSONDecoder().raw_decode(text)
     assert report["summary"]["FAIL"] == 0

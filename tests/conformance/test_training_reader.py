@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot_datasets import assert_same_item
 from support.docs import run_examples
-from support.export import export, make_run
+from support.export import export, export_in_files, make_run
 
 LENGTHS = (7, 11, 5, 9)
 
@@ -24,7 +24,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of several files with depth."""
     folder = tmp_path_factory.mktemp("datasets")
     run = make_run(folder / "run", LENGTHS, depth=True)
-    export(run, folder / "d", privileged=True, depth=True, video_files_mb=0.002, data_files_mb=0.004)
+    export_in_files(run, folder / "d", privileged=True, depth=True, video_mb=0.002, data_mb=0.004)
     assert len(list((folder / "d" / "data").rglob("file-*"))) > 1
     return folder / "d"
 

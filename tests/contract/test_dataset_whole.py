@@ -16,7 +16,7 @@ import pytest
 from support.check import change_table, checked, edit_json, edit_parquet
 from support.commands import exit_code, words_of
 from support.drawn_datasets import write_v21
-from support.export import content_of, export, make_run, recordings
+from support.export import content_of, export, export_in_files, make_run, recordings
 
 NUM_EPISODES, LENGTH = 4, 8
 READERS = {
@@ -58,7 +58,7 @@ def exported(run: Path) -> Path:
 @pytest.fixture(scope="module")
 def apart(run: Path) -> Path:
     """The same dataset with separate files for each episode."""
-    export(run, run.parent / "apart", data_files_mb=1e-6, video_files_mb=1e-6)
+    export_in_files(run, run.parent / "apart", data_mb=1e-6, video_mb=1e-6)
     assert len(list((run.parent / "apart").glob("data/*/*.parquet"))) == NUM_EPISODES
     return run.parent / "apart"
 

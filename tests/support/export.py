@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from demorec.core.config import VideoConfig
 from demorec.core.tables import EXPORTERS
 from demorec.datasets.lerobot import export as lerobot_export
+from demorec.datasets.lerobot import prepare
+from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.options import ExportReport
 from demorec.extensions.doctor.checks import lerobot_opens
 from support.recording import write_episode
@@ -77,6 +80,20 @@ def without_verification(patch: pytest.MonkeyPatch) -> None:
     """Skip the verification as if LeRobot, which takes seconds to load, were not installed."""
     for module in (lerobot_export, lerobot_opens):
         patch.setattr(module, "lerobot_is_installed", lambda: False)
+
+
+def export_in_files(
+    sources: Path, out: Path, *, data_mb: float, video_mb: float, chunk: int = 1000, **options: Any
+) -> ExportReport:
+    """Export to LeRobot with other limits of files and chunk folders than its defaults."""
+    limits: dict[str, Any] = {
+        "data_files_size_in_mb": data_mb,
+        "video_files_size_in_mb": video_mb,
+        "chunks_size": chunk,
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(prepare, "DatasetInfo", partial(DatasetInfo, **limits))
+        return export(sources, out, **options)
 
 
 def data_table(dataset: Path) -> pa.Table:

@@ -12,7 +12,7 @@ import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from support.export import data_table, episode_rows, export, files_of, info, make_run, recordings
+from support.export import data_table, episode_rows, export, export_in_files, files_of, info, make_run, recordings
 from support.recording import make_episode, write_episode
 
 from demorec.core.config import VideoConfig
@@ -40,7 +40,7 @@ def vectors(dataset: Path, name: str) -> np.ndarray[Any, Any]:
 
 def test_the_digest_depends_on_the_content_alone(run: Path, tmp_path: Path) -> None:
     whole = export(run, tmp_path / "a").digest
-    split = export(run, tmp_path / "b", video_files_mb=0.005, data_files_mb=0.005).digest
+    split = export_in_files(run, tmp_path / "b", video_mb=0.005, data_mb=0.005).digest
     assert split == whole == dataset_digest(tmp_path / "b")
     assert len(list((tmp_path / "b" / "data").glob("*/*.parquet"))) > 1
     assert export(run, tmp_path / "c", episodes=":3").digest != whole

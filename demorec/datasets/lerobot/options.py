@@ -7,15 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.annotate import KINDS, LanguageKind
-from demorec.core.errors import ConfigError, OptionError, check_option
+from demorec.core.errors import ConfigError, OptionError
 from demorec.core.options import Rare
 from demorec.datasets.options import CommonOptions, Exporter
 from demorec.episode.features import STATE_KINDS, StateKind
 from demorec.robots.motors import MotorUnits
-
-MIN_FILE_MIB = 1e-6
-MAX_FILE_MIB = 1e6
-"""Maximum file size, a terabyte, in MiB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,12 +57,6 @@ class ExportOptions(CommonOptions):
     """Make an uploaded dataset public."""
     license: Rare[str | None] = None
     """Licence in the dataset card (auto: apache-2.0 for simulated episodes, none for others)."""
-    data_files_mb: Rare[float] = 100
-    """Maximum size of a parquet file in MiB."""
-    video_files_mb: Rare[float] = 200
-    """Maximum size of an mp4 file in MiB."""
-    files_per_chunk: Rare[int] = 1000
-    """Number of files in a chunk folder."""
 
     @property
     def spoken(self) -> tuple[LanguageKind, ...]:
@@ -93,9 +83,6 @@ class ExportOptions(CommonOptions):
         if unknown := [kind for kind in self.language or () if kind not in KINDS]:
             raise OptionError("language", f"names {unknown[0]!r}, its kinds are {', '.join(KINDS)}.")
         check_repo_id(self.repo_id)
-        for name in ("data_files_mb", "video_files_mb"):
-            check_option(name, getattr(self, name), MIN_FILE_MIB, MAX_FILE_MIB, "MiB")
-        check_option("files_per_chunk", self.files_per_chunk, 1, 1_000_000)
 
 
 def check_repo_id(repo_id: str) -> None:

@@ -148,9 +148,6 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         fps=episode.fps,
         features=_dataset_features(episode, video_infos),
         robot_type=episode.info.robot_name,
-        chunks_size=options.files_per_chunk,
-        data_files_size_in_mb=options.data_files_mb,
-        video_files_size_in_mb=options.video_files_mb,
     )
     return ExportedEpisode(
         data=data,
