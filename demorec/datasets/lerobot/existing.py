@@ -15,7 +15,6 @@ from typing import Any
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.core.replacing import files_below
-from demorec.datasets.lerobot.facts import PROGRESS_PATH
 from demorec.datasets.lerobot.files import open_table, read_json, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import (
@@ -26,6 +25,7 @@ from demorec.datasets.lerobot.layout import (
     DatasetInfo,
 )
 from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.datasets.lerobot.progress import PROGRESS_PATH
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.datasets.lerobot.stats import NAMES, Statistics
 from demorec.datasets.lerobot.writer import DatasetStart

@@ -19,13 +19,13 @@ from demorec.core.processes import available_cores, in_turn
 from demorec.core.replacing import shown
 from demorec.datasets.lerobot.card import has_own_card, write_card
 from demorec.datasets.lerobot.existing import features_to_append, link_files, start_after
-from demorec.datasets.lerobot.facts import FACTS, EpisodeStages, write_progress
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import CODEBASE_VERSION, combined_digest
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, GROWING_DATASET
 from demorec.datasets.lerobot.prepare import NO_PLACE, ExportedEpisode, export_episode, prepare_episode
+from demorec.datasets.lerobot.progress import EpisodeStages, write_progress
 from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, Verifier, lerobot_is_installed
 from demorec.datasets.lerobot.writer import DatasetStart, DatasetWriter
 from demorec.datasets.options import ExportReport, ProgressCallback
@@ -140,7 +140,7 @@ class _Export:
     def _start(self, first: ExportedEpisode) -> DatasetStart:
         existing, start = self._existing, self._begin
         if existing is None or start is None:
-            return DatasetStart(info=first.info, facts=FACTS if first.data.facts else {}, configs={})
+            return DatasetStart(info=first.info, configs={})
         self._left_out = features_to_append(existing.root, start.info, first.info)
         return start
 

@@ -11,6 +11,7 @@ Files are opened on demand, so that a missing or damaged one affects only its ep
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -50,6 +51,9 @@ _MAX_LISTED = 50
 """Maximum episodes listed in a sentence."""
 _MAX_OPEN_VIDEOS = 16
 """Maximum video files with a cached index; an index of 15 minutes takes 1 MB."""
+_LEROBOT_COLUMN = re.compile(
+    r"(episode_index|tasks|length|dataset_from_index|dataset_to_index)$|(stats|videos|data|meta)/"
+)
 _BY_ROWS = f"they were found by the episode_index of the rows ({REPAIR} writes the table again)."
 _KNOWN = ("source", "success", "failure_reason", "root_seed", "cameras", "robot_digest")
 """Columns of the sidecar that external recordings can hold; the rest is for simulated episodes only."""
@@ -312,9 +316,8 @@ class LeRobotFolder:
     @cached_property
     def fact_types(self) -> Mapping[str, pa.DataType]:
         """Columns of the episodes' table beyond LeRobot's own -> their types; empty before v3.0."""
-        from demorec.datasets.lerobot.facts import fact_columns
-
-        return fact_columns(self.episode_tables)
+        schema = open_table(self.episode_tables[0]).schema_arrow if self.episode_tables else ()
+        return {item.name: item.type for item in schema if not _LEROBOT_COLUMN.match(item.name)}
 
     @cached_property
     def known(self) -> Mapping[int, dict[str, Any]]:

@@ -33,7 +33,16 @@ from demorec.episode.validity import read_episode_info
 
 OLD_STATS = "meta/episodes_stats.jsonl"
 """Statistics of each episode before v3.0."""
-_SIDECAR = ("source", "success", "failure_phase", "failure_reason", "num_retries", "attempt", "run_episode_index")
+_SIDECAR = (
+    "source",
+    "success",
+    "failure_phase",
+    "failure_reason",
+    "num_retries",
+    "attempt",
+    "run_episode_index",
+    "root_seed",
+)
 """Columns of the sidecar for selecting episodes."""
 _DTYPE_NAMES = {"halffloat": "float16", "float": "float32", "double": "float64", "large_string": "string"}
 """Arrow's type names -> LeRobot's, if different."""

@@ -18,7 +18,6 @@ from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.episode import DONE, REWARD, SCALARS, SUCCESS, ExportCamera, ExportEpisode
 from demorec.datasets.lerobot.boxes import SeenByCamera
 from demorec.datasets.lerobot.depth import depth_info, depth_video
-from demorec.datasets.lerobot.facts import EpisodeStages, episode_facts, episode_stages
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language, language_arrays
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -29,6 +28,7 @@ from demorec.datasets.lerobot.layout import (
 )
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.options import ExportOptions
+from demorec.datasets.lerobot.progress import EpisodeStages, episode_stages
 from demorec.datasets.lerobot.robots import IN_MOTOR_UNITS, motor_features
 from demorec.datasets.lerobot.sidecar import EpisodeRecord
 from demorec.datasets.lerobot.stats import PixelHistogram, Statistics, colour_levels
@@ -140,7 +140,6 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         videos=videos,
         video_info=video_infos,
         pixels=pixels,
-        facts={} if episode.scene is None else episode_facts(recording),
         record=EpisodeRecord.of(episode),
         boxes=_episode_boxes(episode) if options.boxes else {},
     )

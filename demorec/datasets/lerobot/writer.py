@@ -98,14 +98,14 @@ class DatasetStart:
 
     Attributes:
         info: Features, limits, and the numbers of existing episodes and frames.
-        facts: Fact columns in the table of episodes -> type (`demorec.datasets.lerobot.facts`).
+        facts: Columns of the table of episodes beyond LeRobot's own -> type.
         tasks: Existing instructions in the order of their indices.
         statistics: Statistics of the camera features over the existing episodes.
         configs: Config digest -> configuration, of the existing episodes; None for a dataset without a sidecar.
     """
 
     info: DatasetInfo
-    facts: Mapping[str, pa.DataType]
+    facts: Mapping[str, pa.DataType] = field(default_factory=dict)
     tasks: Sequence[str] = ()
     statistics: Mapping[str, Statistics] = field(default_factory=dict)
     configs: Mapping[str, Any] | None = None

@@ -229,8 +229,6 @@ class _Reader:
 
     def _facts(self, cut: EpisodeSlice, place: EpisodePlace) -> dict[str, Any]:
         facts = self._fact_rows.row(place.episode_index)
-        if "duration_s" in facts:
-            facts["duration_s"] = (cut.last - cut.first) / self._fps
         if "success" in facts and not cut.has_end:
             facts["success"] = None
         return facts if self._plan.is_whole(cut) else facts | _cut_stages(facts, cut, self._fps)
