@@ -70,7 +70,8 @@ def test_another_program_places_the_arm_as_it_was_recorded(exported: Path, tmp_p
             told = pybullet.getJointInfo(body, index, physicsClientId=client)
             joints[told[1].decode()], links[told[12].decode()] = index, index
         drawn = {shape[1] for shape in pybullet.getVisualShapeData(body, physicsClientId=client)}
-        tcp = links[record["spec"]["tcp_link"]]
+        (row,) = pq.read_table(exported / "demorec/episodes").to_pylist()
+        tcp = links[json.loads(row["episode_info"])["simulation"]["robot"]["tcp_link"]]
         for frame in range(0, len(rows), 20):
             for feature, names in record["joints"].items():
                 for name, value in zip(names, rows[frame][feature], strict=True):

@@ -55,7 +55,7 @@ def known_units(folder: LeRobotFolder) -> Mapping[str, tuple[str, ...]]:
     """
     digests = (row["robot_digest"] for row in folder.sidecar(["robot_digest"]))
     digest = next((digest for digest in digests if digest), None)
-    found = {} if digest is None else dict(folder.robot(digest).record.units)
+    found = {} if digest is None else dict(folder.robot(digest).units)
     row = folder.sidecar_row(0)
     if row.get("episode_info") is not None:
         found = {feature.name: feature.units for feature in recorded_info(row, folder.root).features} | found

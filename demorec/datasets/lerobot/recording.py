@@ -276,7 +276,7 @@ class DatasetRecording(Episode):
 
 def with_robot(info: EpisodeInfo, robot: DatasetRobot, roles: Roles) -> EpisodeInfo:
     """Add an arm and the joints that the features move to a description."""
-    features = tuple(robot.record.described(feature, roles.usual_name(feature.name)) for feature in info.features)
+    features = tuple(robot.described(feature, roles.usual_name(feature.name)) for feature in info.features)
     return replace(info, urdf=robot.urdf, features=features)
 
 

@@ -7,7 +7,6 @@ express. Episodes refer to their arm by the digest, so one dataset can hold epis
 from __future__ import annotations
 
 import functools
-import hashlib
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import read_text_limited
-from demorec.core.plain import digest, from_json, to_json
+from demorec.core.plain import digest, from_json, leave_out_default, to_json
 from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.files import MAX_JSON_BYTES, write_text
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
@@ -25,7 +24,6 @@ from demorec.episode.element_names import joint_of
 from demorec.episode.features import ACTION, EE_POSE, STATE
 from demorec.episode.info import Feature
 from demorec.robots.motors import Motors
-from demorec.robots.robot import RobotSpec
 from demorec.robots.so101 import SO101_FOLLOWER
 from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml
 
@@ -47,25 +45,44 @@ _ABSOLUTE = re.compile(r"^(file:|/|~|[A-Za-z]:[\\/]|\\\\)")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotRecord:
-    """Properties of an arm that its URDF cannot express.
+class DatasetRobot:
+    """An arm: its URDF, and properties that a URDF cannot express.
 
     Attributes:
         name: The dataset's `robot_type`.
-        urdf_sha256: SHA-256 (hex) of the URDF file.
+        urdf: Links and joints; of a simulated arm, whose meshes are in its model, with boxes instead.
         joints: Feature -> for each element the URDF joint with that position, "" for other elements.
         units: Feature -> units of its elements, if known; positions are in rad and m otherwise.
         calibration: Feature -> calibration of its elements (`Feature.calibration`), for servos in other units.
-        spec: TCP link, limits and gripper of a simulated arm, and `urdf`, its model with meshes; the URDF here has
-            boxes instead.
     """
 
     name: str
-    urdf_sha256: str
-    joints: Mapping[str, tuple[str, ...]]
+    urdf: str = ""
+    joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     units: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    spec: RobotSpec | None = None
     calibration: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, name: str, urdf: str, moving: Iterable[Feature]) -> DatasetRobot:
+        """Describe an arm by the features that its joints move."""
+        features = list(moving)
+        return cls(
+            name=name,
+            urdf=urdf,
+            joints={feature.name: feature.joints for feature in features},
+            units={feature.name: feature.units for feature in features if feature.units},
+            calibration={feature.name: feature.calibration for feature in features if feature.calibration},
+        )
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """Digest of the whole description; the name of its files."""
+        return digest(self)
+
+    @functools.cached_property
+    def model(self) -> Urdf:
+        """Joint tree; lengths are those of the arm at any scale."""
+        return Urdf.parse(self.urdf)
 
     def described(self, feature: Feature, usual_name: str = "") -> Feature:
         """Return a feature with its joints, units and calibration, if they fit its elements.
@@ -87,22 +104,7 @@ class RobotRecord:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class DatasetRobot:
-    """Content of an arm's two files."""
-
-    record: RobotRecord
-    urdf: str
-
-    @functools.cached_property
-    def digest(self) -> str:
-        """Digest of both files, and their name."""
-        return digest(self.record)
-
-    @functools.cached_property
-    def model(self) -> Urdf:
-        """Joint tree; lengths are those of the arm at any scale."""
-        return Urdf.parse(self.urdf)
+leave_out_default(DatasetRobot, "urdf")
 
 
 def robot_of(episode: ExportEpisode[Any]) -> DatasetRobot | None:
@@ -113,25 +115,14 @@ def robot_of(episode: ExportEpisode[Any]) -> DatasetRobot | None:
         return None
     info = episode.info
     if episode.scene is None:
-        return _robot(info.robot_name, portable_urdf(text), [each for each in info.features if any(each.joints)])
+        moving = [feature for feature in info.features if any(feature.joints)]
+        return DatasetRobot.of(info.robot_name, portable_urdf(text), moving)
     recorded = {feature.name: feature for feature in info.features}
     state, pose = recorded[STATE], recorded[EE_POSE]
     if episode.state == "joint_ee":
         no_joints = ("",) * len(pose.names)
         state = replace(state, joints=(*state.joints, *no_joints), units=(*state.units, *pose.units))
-    return _robot(info.robot_name, text, [state], spec=info.simulated.robot)
-
-
-def _robot(name: str, urdf: str, moving: Iterable[Feature], **known: Any) -> DatasetRobot:
-    record = RobotRecord(
-        name=name,
-        urdf_sha256=_sha256(urdf),
-        joints={feature.name: feature.joints for feature in moving},
-        units={feature.name: feature.units for feature in moving if feature.units},
-        calibration={feature.name: feature.calibration for feature in moving if feature.calibration},
-        **known,
-    )
-    return DatasetRobot(record=record, urdf=urdf)
+    return DatasetRobot.of(info.robot_name, text, [state])
 
 
 @functools.cache
@@ -152,7 +143,7 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
             # An opening in metres is not a jaw angle.
             known = zip(names, stems, strict=True)
             joints = tuple(stem if stem in robot.joint_names and name != _IN_METRES else "" for name, stem in known)
-            return _robot(robot.name, urdf, [Feature(name=STATE, names=names, joints=joints)])
+            return DatasetRobot.of(robot.name, urdf, [Feature(name=STATE, names=names, joints=joints)])
     return None
 
 
@@ -168,7 +159,7 @@ def robot_of_motors(motors: Motors) -> DatasetRobot:
     from demorec.mcap.description import robot_description  # loads all code for reading recordings
 
     (model,) = (ROBOTS.load(name).urdf for name, arm in IN_MOTOR_UNITS.items() if arm.robot_type == motors.robot_type)
-    return _robot(motors.robot_type, robot_description(model, 1.0), motor_features(motors))
+    return DatasetRobot.of(motors.robot_type, robot_description(model, 1.0), motor_features(motors))
 
 
 @functools.lru_cache(maxsize=8)  # usually the same for all recordings of a run
@@ -198,7 +189,7 @@ def write_robot(root: Path, robot: DatasetRobot) -> None:
     """Write the files of an arm unless they exist."""
     folder = root / ROBOTS_DIR
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in ((".urdf", robot.urdf), (".json", to_json(robot.record, indent=2) + "\n")):
+    for name, text in ((".urdf", robot.urdf), (".json", to_json(replace(robot, urdf=""), indent=2) + "\n")):
         path = folder / f"{robot.digest}{name}"
         if not path.exists():
             write_text(path, text)
@@ -212,18 +203,14 @@ def read_robot(root: Path, name: str) -> DatasetRobot:
     try:
         if not _DIGEST.fullmatch(name):
             raise ValueError(f"{name[:20]!r} is not a digest")
-        record = from_json(read_text_limited(path, MAX_JSON_BYTES), RobotRecord)
-        robot = DatasetRobot(record=record, urdf=read_text_limited(path.with_suffix(".urdf"), MAX_BYTES))
-        if robot.digest != name or _sha256(robot.urdf) != record.urdf_sha256:
+        described = from_json(read_text_limited(path, MAX_JSON_BYTES), DatasetRobot)
+        robot = replace(described, urdf=read_text_limited(path.with_suffix(".urdf"), MAX_BYTES))
+        if robot.digest != name:
             raise ValueError("it has changed since it was written")
         joints = {joint.name for joint in robot.model.joints}
-        named = {joint for part in record.joints.values() for joint in part if joint}
+        named = {joint for part in robot.joints.values() for joint in part if joint}
         if missing := named - joints:
             raise ValueError(f"its URDF lacks the joints {', '.join(sorted(missing))}")
     except (OSError, ValueError) as error:
         raise ExportError(f"The description of the robot cannot be read ({describe_error(error)}): {path}") from error
     return robot
-
-
-def _sha256(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()

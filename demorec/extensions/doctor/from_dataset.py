@@ -136,7 +136,7 @@ def _joints(robot: DatasetRobot | None, folder: LeRobotFolder, elements: tuple[s
     if robot is None:
         return ()
     state = folder.roles.state
-    known = robot.record.joints.get(state[0], robot.record.joints.get(STATE, ())) if len(state) == 1 else ()
+    known = robot.joints.get(state[0], robot.joints.get(STATE, ())) if len(state) == 1 else ()
     return known if len(known) == len(elements) else ()
 
 
@@ -151,7 +151,7 @@ def _in_si(
     for name in (name for part in parts for name in part):
         width = columns[name].shape[1]
         usual_name = "action" if name in parts[1] else STATE
-        feature = robot.record.described(Feature(name=name, names=tuple(map(str, range(width)))), usual_name)
+        feature = robot.described(Feature(name=name, names=tuple(map(str, range(width)))), usual_name)
         found[name] = feature.in_si(columns[name])
     return found
 
