@@ -69,24 +69,18 @@ class Export:
         return 0
 
 
-_TAKEN = "taken with --include-failures"
-
-
 def _summary_lines(report: ExportReport) -> Iterator[str]:
     added = f", {report.new_episodes} of them new" if report.new_episodes != report.num_episodes else ""
     yield f"{counted(report.num_episodes, 'episode')}, {report.num_frames} frames{added}: {report.path}"
     if report.skipped_failures:
-        yield f"{counted(report.skipped_failures, 'failed attempt')} left out ({_TAKEN})."
-    if report.skipped_unknown:
-        yield f"{counted(report.skipped_unknown, 'recording')} of unknown outcome left out ({_TAKEN})."
+        skipped = counted(report.skipped_failures, "failed or unfinished attempt")
+        yield f"{skipped} left out (taken with --include-failures)."
     if report.skipped_unwanted:
         yield f"{counted(report.skipped_unwanted, 'recording')} left out by --episodes or --corrected-only."
     if report.left_out:
         yield f"Left out, since the dataset does not have them: {', '.join(report.left_out)}."
     if report.depth_left_out:
         yield f"Depth images are left out without --depth: camera {', '.join(report.depth_left_out)}."
-    if report.silent:
-        yield f"No subtasks are known, so none are written, for {', '.join(report.silent)}."
     yield from (f"Images re-encoded: camera {what}." for what in report.transcoded)
     if report.verified_frames:
         yield f"Verified: {report.verified_frames} frames read through LeRobot equal the recordings."

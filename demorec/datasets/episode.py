@@ -277,22 +277,15 @@ class ExportEpisode[O: CommonOptions]:
 def _refuse_without_scene(info: EpisodeInfo, options: CommonOptions, recording: Recording) -> None:
     """Raise ConfigError for options that only an episode with a known scene can serve."""
     state = getattr(options, "state", "joint")
-    spoken = [kind for kind in getattr(options, "language", None) or () if kind != "subtask"]
-    scenic = ("privileged", "intervention", "progress", "boxes")  # all but the first exist only for LeRobot datasets
-    needs_scene = [name for name in scenic if getattr(options, name, False)]
-    problems = (
-        options.action != "joint"
-        and f"action is {options.action!r}, but external actions are exported unchanged (joint)",
-        state != "joint" and f"state is {state!r}, but an external state is exported unchanged (joint)",
-        spoken
-        and f"language names {spoken[0]!r}, but an external episode has only the subtasks that its source specifies",
-        needs_scene and f"{needs_scene[0]} needs the scene of a simulated episode",
-        options.fps not in (None, info.fps)
-        and f"fps is {options.fps}, but the episode was recorded at {info.fps}, and leaving out frames "
-        "needs the meaning of its actions",
-    )
-    for problem in filter(None, problems):
-        raise ConfigError(f"{problem}: {recording.path}")
+    named = {f"action {options.action}": options.action != "joint", f"state {state}": state != "joint"}
+    named |= {f"fps {options.fps}": options.fps not in (None, info.fps)}
+    named |= {f"language {kind}": kind != "subtask" for kind in getattr(options, "language", None) or ()}
+    # all but the first exist only for LeRobot datasets
+    named |= {name: getattr(options, name, False) for name in ("privileged", "intervention", "progress", "boxes")}
+    if needs_scene := [name for name, is_wanted in named.items() if is_wanted]:
+        raise ConfigError(
+            f"{', '.join(needs_scene)} needs the scene of a simulated episode, leave it out: {recording.path}"
+        )
 
 
 def _frame_stride(recording_fps: int, fps: int | None) -> int:

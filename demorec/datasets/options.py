@@ -65,13 +65,11 @@ class ExportReport:
         path: Path of the dataset.
         num_episodes, num_frames: Current size of the dataset.
         new_episodes: Episodes added by this export.
-        skipped_failures: Failed episodes that were left out.
-        skipped_unknown: Episodes left out because their recordings have no outcome.
+        skipped_failures: Episodes left out because they failed, or their recordings have no outcome.
         skipped_unwanted: Recordings left out by `episodes` and `corrected_only`.
         transcoded: Cameras with re-encoded images, and the reason.
         left_out: Features missing from the dataset that was appended to.
         depth_left_out: Depth cameras of external episodes that were not requested.
-        silent: Recordings of external episodes with requested language, but without subtasks in the source.
         verified_frames: Frames compared through LeRobot; 0 if not requested, or without LeRobot.
         not_verified: Reason why LeRobot did not verify the dataset although requested, as a sentence, or "".
         digest: Content digest, as in `dataset_digest`.
@@ -83,12 +81,10 @@ class ExportReport:
     num_frames: int
     new_episodes: int
     skipped_failures: int = 0
-    skipped_unknown: int = 0
     skipped_unwanted: int = 0
     transcoded: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     depth_left_out: tuple[str, ...] = ()
-    silent: tuple[str, ...] = ()
     verified_frames: int = 0
     not_verified: str = ""
     digest: str = ""

@@ -34,8 +34,8 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-LeftOut = Literal["unwanted", "failures", "unknown"]
-"""Kind of a recording that is not exported: not requested, a failed attempt, or one without a known outcome."""
+LeftOut = Literal["unwanted", "failures"]
+"""Kind of a recording that is not exported: not requested, or a failed attempt or one cut off by a crash."""
 
 
 def why_left_out(recording: Recording, options: CommonOptions) -> LeftOut | None:
@@ -50,7 +50,7 @@ def why_left_out(recording: Recording, options: CommonOptions) -> LeftOut | None
             return "unwanted"
     if options.include_failures or not (recording.success is False or recording.path.parent.name == "failed"):
         return None
-    return "unknown" if recording.outcome is None else "failures"
+    return "failures"
 
 
 def places_of(files: Sequence[Path]) -> list[Path]:
@@ -104,7 +104,7 @@ class Intake:
         """Return the error for an export without selected recordings."""
         corrected = " or were not corrected" if self._options.corrected_only else ""
         return ConfigError(
-            f"Nothing to export. Recordings: {len(self._found)}, failed attempts: {self.skipped['failures']}, "
-            f"unknown outcome: {self.skipped['unknown']} (--include-failures selects both); the others are not "
-            f"in --episodes{corrected}."
+            f"Nothing to export. Recordings: {len(self._found)}, failed or unfinished attempts: "
+            f"{self.skipped['failures']} (--include-failures selects them); the others are not in "
+            f"--episodes{corrected}."
         )

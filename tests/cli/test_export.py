@@ -24,7 +24,7 @@ def test_an_export(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert exit_code("export", "lerobot", run, "--out", out, "--repo-id", "me/cubes", "--no-verify") == 0
     printed = capsys.readouterr()
     assert "2 episodes, 15 frames" in printed.out
-    assert "1 failed attempt left out" in printed.out
+    assert "1 failed or unfinished attempt left out" in printed.out
     assert dataset_digest(out) in printed.out
     assert printed.err == ""  # quiet without a terminal
     assert "# me/cubes" in (out / "README.md").read_text()
@@ -38,7 +38,7 @@ def test_recordings_moved_into_failed_stay_out(run: Path, tmp_path: Path, capsys
     assert exit_code("export", "lerobot", sorted_run, "--out", tmp_path / "d", "--no-verify") == 0
     printed = capsys.readouterr().out
     assert "1 episode, 7 frames" in printed
-    assert "2 failed attempts left out" in printed
+    assert "2 failed or unfinished attempts left out" in printed
 
 
 def test_recordings_left_out_by_flags_are_counted(

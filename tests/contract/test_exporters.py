@@ -76,7 +76,7 @@ def test_its_result_is_recognised(exporter: str, run: Path, tmp_path: Path) -> N
             refuse_inside([out / "inner"])
 
 
-def test_a_recovered_recording_is_not_a_failed_attempt(exporter: str, run: Path, tmp_path: Path) -> None:
+def test_a_recovered_recording_is_left_out_like_a_failed_attempt(exporter: str, run: Path, tmp_path: Path) -> None:
     sources = [run / "episodes" / "episode_000000.mcap", tmp_path / "recovered.mcap"]
     info, frames, _ = make_episode(num_frames=70, episode_index=7)
     with suppress(InterruptedError), EpisodeWriter(tmp_path / "cut.mcap", info) as writer:
@@ -85,8 +85,8 @@ def test_a_recovered_recording_is_not_a_failed_attempt(exporter: str, run: Path,
         raise InterruptedError
     recover(tmp_path / "cut.mcap.part", sources[1])
     report = export(sources, tmp_path / "d", exporter)
-    assert (report.num_episodes, report.skipped_failures, report.skipped_unknown) == (1, 0, 1)
-    with pytest.raises(ConfigError, match="failed attempts: 0, unknown outcome: 1"):
+    assert (report.num_episodes, report.skipped_failures) == (1, 1)
+    with pytest.raises(ConfigError, match="failed or unfinished attempts: 1"):
         export(sources[1:], tmp_path / "e", exporter)
 
 

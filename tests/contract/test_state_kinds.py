@@ -119,6 +119,6 @@ def test_states_of_two_kinds_do_not_go_into_one_dataset(run: Path, dataset: Path
 
 def test_the_state_of_an_external_episode_is_unchanged(tmp_path: Path) -> None:
     write_external(tmp_path / "e.mcap", make_external(cameras=()))
-    with pytest.raises(ConfigError, match="exported unchanged"):
+    with pytest.raises(ConfigError, match="state joint_ee needs the scene"):
         export_lerobot([tmp_path / "e.mcap"], tmp_path / "ds", replace(SMALL, action="joint"))
     assert not (tmp_path / "ds").exists()

@@ -88,7 +88,7 @@ class _Export:
         self._left_out: tuple[str, ...] = ()
         self._transcoded: dict[str, None] = {}
         self._digests: dict[Path, str] = {}
-        self._silent: list[str] = []
+        self._has_statements = False
         self._stages: list[EpisodeStages] = []
         self._intake = Intake(found, options)
 
@@ -104,8 +104,7 @@ class _Export:
         with DatasetWriter(folder, self._start(first)) as writer:
             for path, episode in chain([begin], episodes):
                 self._digests[path] = writer.add(episode.data)
-                if self._options.language is not None and not episode.has_statements:
-                    self._silent.append(path.name)
+                self._has_statements |= episode.has_statements
                 self._transcoded.update(dict.fromkeys(episode.transcoded))
                 if episode.stages is not None:
                     self._stages.append(episode.stages)
@@ -122,12 +121,10 @@ class _Export:
             num_frames=finished.total_frames,
             new_episodes=len(self._digests),
             skipped_failures=self._intake.skipped["failures"],
-            skipped_unknown=self._intake.skipped["unknown"],
             skipped_unwanted=self._intake.skipped["unwanted"],
             transcoded=tuple(self._transcoded),
             left_out=(*self._left_out, *(NO_PLACE if self._options.motor_units else ())),
             depth_left_out=first.depth_left_out,
-            silent=tuple(self._silent),
             digest=combined_digest(finished, [*self._before, *self._digests.values()]),
         )
 
@@ -175,7 +172,7 @@ class _Export:
 
     def _refuse_silence(self) -> None:
         """Raise ConfigError if language is requested and a new dataset would have no statements."""
-        if self._existing is None and self._options.language is not None and len(self._silent) == len(self._digests):
+        if self._existing is None and self._options.language is not None and not self._has_statements:
             raise ConfigError(
                 "These episodes have no language, since no source specifies subtasks: leave --language out."
             )

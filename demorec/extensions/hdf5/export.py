@@ -82,7 +82,6 @@ def _write(
         new_episodes=intake.num_taken,
         depth_left_out=depth_left_out,
         skipped_failures=intake.skipped["failures"],
-        skipped_unknown=intake.skipped["unknown"],
         skipped_unwanted=intake.skipped["unwanted"],
     )
 
