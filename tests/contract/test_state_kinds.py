@@ -113,7 +113,7 @@ def test_lerobot_gets_the_kind_of_state() -> None:
 def test_states_of_two_kinds_do_not_go_into_one_dataset(run: Path, dataset: Path) -> None:
     before = states(dataset)
     with pytest.raises(ConfigError, match=STATE):
-        export_lerobot([run], dataset, ExportOptions(verify=False, append=True, allow_duplicates=True))
+        export_lerobot([run], dataset, ExportOptions(verify=False, append=True))
     assert np.array_equal(states(dataset), before)
 
 

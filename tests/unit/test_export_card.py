@@ -27,7 +27,7 @@ def test_an_edited_card_stays_when_the_dataset_is_replaced(tmp_path: Path) -> No
     card.write_text("what I found out about these")
     export(run, tmp_path / "d", overwrite=True)
     assert card.read_text() == "what I found out about these"
-    export(run, tmp_path / "d", append=True, allow_duplicates=True)
+    export(make_run(tmp_path / "more", (7,), seed=1, cameras=()), tmp_path / "d", append=True)
     assert card.read_text() == "what I found out about these"
 
 

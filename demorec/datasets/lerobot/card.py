@@ -13,7 +13,7 @@ from pathlib import Path
 from demorec.core.text import markdown
 from demorec.datasets.episode import DONE, INTERVENTION, REWARD, SUCCESS
 from demorec.datasets.lerobot.episode_places import read_tasks
-from demorec.datasets.lerobot.files import rows_in, write_text
+from demorec.datasets.lerobot.files import read_table, tables_in, write_text
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
@@ -137,7 +137,8 @@ def _marked(text: str) -> str:
 
 
 def _card(root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mapping[str, str]) -> str:
-    seeds = [row["root_seed"] for row in rows_in(root, f"{SIDECAR_DIR}/episodes", ["root_seed"])]
+    tables = [read_table(path, ["root_seed"]) for path in tables_in(root, f"{SIDECAR_DIR}/episodes")]
+    seeds = [seed for table in tables for seed in table.column("root_seed").to_pylist()]
     # recordings of other robots have no seed, episodes of other writers no row
     is_simulated = None not in seeds and len(seeds) == info.total_episodes
     meaning = {**_MEANING, **{name: markdown(source) for name, source in meanings.items() if source}}

@@ -107,12 +107,9 @@ def why_not_recorded(name: str, feature: DatasetFeature) -> str:
         return _why_no_distances(feature)
     if feature.dtype in ("video", "image"):
         return ""
-    if feature.dtype not in _RECORDED:
-        return f"it is {feature.dtype}, and recordings of other robots hold numbers"
-    if feature.shape[0] > _MAX_ELEMENTS:
-        return f"it has {feature.shape[0]:,} numbers a row, and recordings of other robots hold up to {_MAX_ELEMENTS:,}"
-    if len(feature.shape) > 1:
-        return f"it is an array of {'x'.join(map(str, feature.shape))}, and recordings of other robots hold vectors"
+    if feature.dtype not in _RECORDED or len(feature.shape) > 1 or feature.shape[0] > _MAX_ELEMENTS:
+        kind = f"{feature.dtype} of shape {'x'.join(map(str, feature.shape))}"
+        return f"it holds {kind}, and recordings of other robots hold vectors of up to {_MAX_ELEMENTS:,} numbers"
     return ""
 
 

@@ -164,10 +164,9 @@ class _Export:
         there = {digest: number for number, digest in enumerate(self._before)}
         known = {path: there[digest] for path, digest in self._digests.items() if digest in there}
         twice = [f"{path.name} (its episode {number})" for path, number in known.items()]
-        if twice and not self._options.allow_duplicates:
+        if twice:
             raise ConfigError(
-                f"The dataset has {len(twice)} of these episodes already: {shown(twice)}. Leave them out with "
-                "--episodes, or use --allow-duplicates to add them again."
+                f"The dataset has {len(twice)} of these episodes already, leave them out (--episodes): {shown(twice)}"
             )
 
     def _refuse_silence(self) -> None:

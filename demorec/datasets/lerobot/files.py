@@ -90,14 +90,6 @@ def tables_in(root: Path, place: str) -> list[Path]:
     return sorted(root.glob(f"{place}/*/*.parquet"))
 
 
-def rows_in(
-    root: Path, place: str, columns: Sequence[str], *, schema: pa.Schema | None = None
-) -> Iterator[dict[str, Any]]:
-    """Yield all rows of such tables; arguments and errors as in `read_table`."""
-    for path in tables_in(root, place):
-        yield from read_table(path, columns, schema=schema).to_pylist()
-
-
 def table_batches(
     path: Path, columns: Sequence[str] | None = None, *, rows: int = _ROWS_AT_ONCE
 ) -> Iterator[pa.RecordBatch]:

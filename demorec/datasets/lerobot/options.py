@@ -43,8 +43,6 @@ class ExportOptions(CommonOptions):
     """Name of the dataset on the Hub, OWNER/NAME; also written into its card."""
     append: bool = False
     """Add the episodes to the existing dataset."""
-    allow_duplicates: Rare[bool] = False
-    """With --append: add episodes again that the dataset already contains, instead of refusing them."""
     intervention: Rare[bool] = False
     """Add the column intervention of LeRobot's DAgger: true where the expert acts in an episode that a policy began."""
     verify: bool = True
@@ -69,8 +67,6 @@ class ExportOptions(CommonOptions):
         super().validate()
         if self.append and self.overwrite:
             raise ConfigError("--append and --overwrite exclude each other: choose one.")
-        if self.allow_duplicates and not self.append:
-            raise ConfigError("--allow-duplicates belongs to --append.")
         for name in ("boxes", "progress"):
             if self.append and getattr(self, name):
                 raise ConfigError(f"--{name} is written for a whole dataset: leave out --append and export it again.")
