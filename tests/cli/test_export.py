@@ -71,16 +71,13 @@ def test_mistakes_are_one_sentence(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("token", "message"), [(None, "hf auth login"), ("hf_made_up", "was not uploaded to me/cubes")]
-)
+@pytest.mark.parametrize("token", [None, "hf_made_up"])
 def test_a_failed_upload_keeps_the_dataset(
     run: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
     token: str | None,
-    message: str,
 ) -> None:
     """The upload fails without a token, and without a network."""
     monkeypatch.setattr("huggingface_hub.get_token", lambda: token)
@@ -89,7 +86,8 @@ def test_a_failed_upload_keeps_the_dataset(
     arguments = ("--no-verify", "--push-to-hub", "--repo-id", "me/cubes")
     assert exit_code("export", "lerobot", run, "--out", out, *arguments) == 1
     printed = capsys.readouterr().err
-    assert message in printed
+    assert "was not uploaded to me/cubes" in printed
+    assert "Type hf auth login" in " ".join(printed.split())
     assert "Traceback" not in printed
     assert len(episode_rows(out)) == 2
 
@@ -111,7 +109,6 @@ def test_an_upload_is_private_and_tagged(
             calls.append(("tag", repo_id, arguments["tag"]))
 
     monkeypatch.setattr("huggingface_hub.HfApi", Hub)
-    monkeypatch.setattr("huggingface_hub.get_token", lambda: "hf_made_up")
     out = tmp_path / "d"
     arguments = ("--no-verify", "--push-to-hub", "--repo-id", "me/cubes")
     assert exit_code("export", "lerobot", run, "--out", out, *arguments) == 0

@@ -183,16 +183,11 @@ def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
     folder is unchanged.
     """
     try:
-        from huggingface_hub import HfApi, get_token
+        from huggingface_hub import HfApi
     except ImportError as error:
         raise MissingDependencyError(
             f"Uploading the dataset, which is kept ({folder}),", "huggingface_hub", "pip install huggingface_hub"
         ) from error
-    if get_token() is None:
-        raise ExportError(
-            "The dataset was not uploaded, there is no Hugging Face token: type hf auth login, or set HF_TOKEN, and "
-            f"then: hf upload {repo_id} {folder} --repo-type dataset"
-        )
     hub = HfApi()
     try:
         url = hub.create_repo(repo_id, repo_type="dataset", private=private, exist_ok=True)
@@ -205,7 +200,8 @@ def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
         hub.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset", exist_ok=True)
     except Exception as error:  # the Hub's client raises errors of several HTTP libraries
         raise ExportError(
-            f"The dataset was not uploaded to {repo_id} ({describe_error(error)}); it is kept: {folder}"
+            f"The dataset was not uploaded to {repo_id} ({describe_error(error)}), it is kept. Type hf auth login, or "
+            f"set HF_TOKEN, then: hf upload {repo_id} {folder} --repo-type dataset"
         ) from error
     return str(url)
 

@@ -12,13 +12,12 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
-from demorec.datasets.lerobot.episode_places import EpisodePlace, has_episode_table
+from demorec.datasets.lerobot.episode_places import EpisodePlace
 from demorec.datasets.lerobot.files import open_table, read_json, read_json_lines, read_table, table_batches
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     NUMBER_TYPES,
-    OLD_EPISODES_PATH,
     STATS_PATH,
     DatasetInfo,
     FeatureType,
@@ -203,26 +202,8 @@ def episode_columns(folder: LeRobotFolder) -> list[dict[str, Any]]:
         }
         for place in folder.places
     ]
-    more = episode_facts(folder)
-    if folder.info.is_old and has_episode_table(folder.root, folder.info):
-        more = read_json_lines(folder.root / OLD_EPISODES_PATH)
     sidecar = {row["episode_index"]: row for row in folder.sidecar(_SIDECAR)}
-    for row, facts in zip(found, more, strict=True):
-        known = {**sidecar.get(row["episode_index"], {}), **facts}
-        row |= {name: value for name, value in known.items() if name not in row}
-    return found
-
-
-def episode_facts(folder: LeRobotFolder) -> list[dict[str, Any]]:
-    """Read the columns of the episodes' table beyond LeRobot's own, for each episode in order."""
-    if folder.info.is_old or not has_episode_table(folder.root, folder.info):
-        return [{} for _ in folder.places]
-    found: list[dict[str, Any]] = []
-    for path in folder.episode_tables:
-        there = open_table(path).schema_arrow.names
-        for batch in table_batches(path, ["episode_index", *(name for name in folder.fact_types if name in there)]):
-            found += batch.to_pylist()
-    return found
+    return [{**row, **sidecar.get(row["episode_index"], {})} for row in found]
 
 
 def episode_statistics(folder: LeRobotFolder, features: Sequence[str]) -> Iterator[tuple[int, str, Mapping[str, Any]]]:
