@@ -312,7 +312,7 @@ def _dataset(path: Path, named: NamedRoles) -> Described:
         facts += [*_role_facts(roles), *more, *(("problem", problem) for problem in problems[:_MOST_PROBLEMS])]
         if len(problems) > _MOST_PROBLEMS:
             facts.append(("problems", f"{len(problems)} in all; demorec check reports more"))
-        rows = _feature_rows(None if roles is None else folder, info)
+        rows = _feature_rows(roles, info)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise RecordingError(f"The dataset's info.json is damaged ({describe_error(error)}): {file}") from error
     plain = {"kind": "dataset", "path": str(path), "info": info, "problems": problems, "roles": _plain_roles(roles)}
@@ -351,28 +351,21 @@ def _dataset_content(path: Path, named: NamedRoles) -> tuple[LeRobotFolder | Non
     return folder, facts, problems
 
 
-def _feature_rows(folder: LeRobotFolder | None, info: Mapping[str, Any]) -> list[tuple[str, ...]]:
+def _feature_rows(roles: Roles | None, info: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """A row for each feature of a dataset, after a header: features without a role first, counters last.
 
     Args:
-        folder: The open dataset; None if info.json cannot be interpreted.
+        roles: Role of each feature; None if info.json cannot be interpreted.
         info: Content of info.json, unchecked.
     """
     types = {name: (str(item["dtype"]), "x".join(map(str, item["shape"]))) for name, item in info["features"].items()}
-    if folder is None:
+    if roles is None:
         return [("feature", "dtype", "shape"), *((name, *kind) for name, kind in types.items())]
-    from demorec.datasets.lerobot.inspect import known_units
     from demorec.episode.roles import ROLES
 
-    units: Mapping[str, tuple[str, ...]] = {}
-    with suppress(ExportError):  # demorec check reports it
-        units = known_units(folder)
-    roles = folder.roles
     order = [None, *(role for role in ROLES if role is not None)]
-    rows = [("role", "feature", "dtype", "shape", "elements", "units")]
+    rows = [("role", "feature", "dtype", "shape", "elements")]
     for name in sorted(roles.of, key=lambda name: order.index(roles.of[name])):
         column, role = roles.columns[name], roles.of[name]
-        unknown = "unknown" if column.is_vector and role != "label" else ""
-        unit = ", ".join(dict.fromkeys(filter(None, units.get(name, ())))) or unknown
-        rows.append((role or _NO_ROLE, name, *types[name], _elements_in_words(column.elements), unit))
-    return rows + [("", name, *kind, "", "") for name, kind in types.items() if name not in roles.of]
+        rows.append((role or _NO_ROLE, name, *types[name], _elements_in_words(column.elements)))
+    return rows + [("", name, *kind, "") for name, kind in types.items() if name not in roles.of]

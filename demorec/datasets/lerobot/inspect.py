@@ -26,7 +26,6 @@ from demorec.datasets.lerobot.layout import (
 )
 from demorec.datasets.lerobot.rows import DataRows
 from demorec.datasets.lerobot.stats import NAMES
-from demorec.episode.features import ACTION, STATE
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
 
@@ -45,23 +44,6 @@ _SIDECAR = (
 """Columns of the sidecar for selecting episodes."""
 _DTYPE_NAMES = {"halffloat": "float16", "float": "float32", "double": "float64", "large_string": "string"}
 """Arrow's type names -> LeRobot's, if different."""
-
-
-def known_units(folder: LeRobotFolder) -> Mapping[str, tuple[str, ...]]:
-    """Feature -> units of its elements, from the sidecar's robot and first episode; empty without a sidecar. An action
-    with the elements of the state has the state's units. Raises ExportError if the tables or the robot's description
-    are damaged.
-    """
-    digests = (row["robot_digest"] for row in folder.sidecar(["robot_digest"]))
-    digest = next((digest for digest in digests if digest), None)
-    found = {} if digest is None else dict(folder.robot(digest).units)
-    row = folder.sidecar_row(0)
-    if row.get("episode_info") is not None:
-        found = {feature.name: feature.units for feature in recorded_info(row, folder.root).features} | found
-    state, action = (folder.info.features.get(name) for name in (STATE, ACTION))
-    if STATE in found and state is not None and action is not None and state.names == action.names:
-        found.setdefault(ACTION, found[STATE])
-    return found
 
 
 def recorded_info(row: Mapping[str, Any], root: Path) -> EpisodeInfo:
