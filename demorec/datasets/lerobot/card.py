@@ -11,47 +11,20 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from demorec.core.text import markdown
-from demorec.datasets.episode import DONE, INTERVENTION, REWARD, SUCCESS
 from demorec.datasets.lerobot.episode_places import read_tasks
 from demorec.datasets.lerobot.files import read_table, tables_in, write_text
-from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
+from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, SIDECAR_DIR
 from demorec.episode.features import (
     ACTION,
-    COMMAND,
-    EE_POSE,
-    ENVIRONMENT_STATE,
-    IMAGE_PREFIX,
-    STATE,
-    VELOCITY,
     ActionKind,
 )
 
 _MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
 """Last line of a card; its digest reveals whether the card was edited."""
 _MAX_TASKS = 20
-_MEANING = {
-    **dict.fromkeys(AUTOMATIC_FEATURES, "filled in by LeRobot's rules"),
-    "timestamp": "seconds since the episode's start",
-    DONE: "true at the last frame",
-}
-"""Feature -> meaning in every dataset."""
-_SIMULATED_MEANING = {
-    STATE: "joint positions (rad), gripper opening (m)",
-    VELOCITY: "joint velocities (rad/s), speed of the gripper's opening (m/s)",
-    EE_POSE: "tool centre point in the base frame: position (m), quaternion xyzw with x >= 0",
-    ENVIRONMENT_STATE: "privileged: TCP, objects and goals, symmetric and relative quantities first, raw poses last "
-    "(m, rad; base frame)",
-    COMMAND: "commands sent to the motors: joint targets (rad), gripper opening (m)",
-    REWARD: "1 at the last frame of a success, else 0",
-    SUCCESS: "true at the last frame of a success",
-    INTERVENTION: "true where the expert acts in an episode that a policy began; its other frames are the policy's",
-    PERSISTENT: "statements about the episode, each valid from its `timestamp` until the next one of its style; all of "
-    "them in every row",
-    EVENTS: "statements of this row alone",
-}
+_DEPTH_MEANING = "distance along the optical axis, 12-bit logarithmic codes of 0.01 to 10 m; 0.01 m: nothing was hit"
 _ACTION_MEANING: Mapping[ActionKind, str] = {
     "joint": "absolute joint targets (rad), gripper opening (m)",
     "joint_increment": "joint target minus that of the frame before (rad), the first minus the initial positions, plus "
@@ -64,7 +37,8 @@ _ACTION_MEANING: Mapping[ActionKind, str] = {
 _SIMULATED_ROWS = (
     "Row t holds the observation at time t, taken before the action of row t is applied; the action is the expert's "
     "target for the next frame. Where exploration noise was added to the motor commands, the action is derived from "
-    "the clean target. Frame times are multiples of the simulation's frame period, not of a wall clock."
+    "the clean target. Frame times are multiples of the simulation's frame period, not of a wall clock. Poses are in "
+    "the arm's base frame, with quaternions xyzw."
 )
 _RECORDED_ROWS = (
     "Row t holds the data of frame t in the recordings; the table above has the origin of each feature. LeRobot's "
@@ -101,7 +75,7 @@ dataset = LeRobotDataset("{repo_id}", video_backend="pyav")
 
 ## Features
 
-| feature | type | shape | meaning |
+| feature | type | shape | unit or origin |
 |---|---|---|---|
 {features}
 
@@ -113,7 +87,7 @@ dataset = LeRobotDataset("{repo_id}", video_backend="pyav")
 
 def write_card(root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mapping[str, str]) -> None:
     """Write the card of a finished dataset folder, unless it has one of the user; `meanings` has the features'
-    descriptions in the recordings.
+    origin or units in the recordings.
     """
     path = root / CARD_PATH
     if not has_own_card(root):
@@ -141,16 +115,14 @@ def _card(root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mappi
     seeds = [seed for table in tables for seed in table.column("root_seed").to_pylist()]
     # recordings of other robots have no seed, episodes of other writers no row
     is_simulated = None not in seeds and len(seeds) == info.total_episodes
-    meaning = {**_MEANING, **{name: markdown(source) for name, source in meanings.items() if source}}
+    meaning = {name: markdown(text) for name, text in meanings.items()}
+    meaning |= dict.fromkeys((name for name, item in info.features.items() if item.is_depth), _DEPTH_MEANING)
     if is_simulated:
-        meaning |= {**_SIMULATED_MEANING, ACTION: _ACTION_MEANING[options.action]}
-        if options.state == "joint_ee":
-            meaning[STATE] = f"{meaning[STATE]}, {meaning[EE_POSE]}"
+        meaning[ACTION] = _ACTION_MEANING[options.action]
     features = []
     for key, item in info.features.items():
         name = f"`{key}`" if markdown(key) == key else markdown(key)
-        text = _feature_meaning(key, item, meaning)
-        features.append(f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {text} |")
+        features.append(f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {meaning.get(key, '')} |")
     tasks = read_tasks(root)
     listed = [f"- {markdown(task)}" for task in tasks[:_MAX_TASKS]]
     if len(tasks) > _MAX_TASKS:
@@ -176,11 +148,3 @@ def _summary(info: DatasetInfo, *, is_simulated: bool) -> str:
         f"{info.total_episodes} {content}, {info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), "
         "in the LeRobot v3.0 format. Exported by demorec."
     )
-
-
-def _feature_meaning(key: str, item: DatasetFeature, meaning: Mapping[str, str]) -> str:
-    if item.is_depth:
-        return "distance along the optical axis, 12-bit logarithmic codes of 0.01 to 10 m; 0.01 m: nothing was hit"
-    if key.startswith(IMAGE_PREFIX):
-        return f"camera {markdown(key.removeprefix(IMAGE_PREFIX))}, RGB"
-    return meaning.get(key, "as in the recordings")

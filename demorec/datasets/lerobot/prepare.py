@@ -59,7 +59,7 @@ class ExportedEpisode:
         depth_left_out: Depth cameras that were not requested.
         transcoded: Cameras with transcoded images, and the reason.
         has_statements: Whether it has any language.
-        meanings: Feature -> its description in the recording.
+        meanings: Feature -> its origin or units in the recording.
         stages: Its stages, for the progress; None unless requested.
     """
 
@@ -155,7 +155,10 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         depth_left_out=episode.depth_left_out,
         transcoded=tuple(f"{camera.name}, {reason}" for camera, reason in reasons.items() if reason),
         has_statements=bool(language.persistent),
-        meanings={feature.name: feature.source for feature in episode.info.features},
+        meanings={
+            feature.name: feature.source or ", ".join(dict.fromkeys(filter(None, feature.units)))
+            for feature in episode.info.features
+        },
         stages=episode_stages(recording, episode.rows) if options.progress else None,
     )
 
