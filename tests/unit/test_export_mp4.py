@@ -50,7 +50,7 @@ def coded(
 
 def video_of(codec: str, packets: list[bytes]) -> EncodedVideo:
     lengths = [len(packet) for packet in packets]
-    return EncodedVideo.of_access_units(codec, WIDTH, HEIGHT, b"".join(packets), lengths)
+    return EncodedVideo.of_access_units(codec, b"".join(packets), lengths)
 
 
 @pytest.mark.parametrize(("codec", "fps"), [("h264", 30), ("h264", 7), ("h264", 240), ("av1", 30), ("av1", 15)])

@@ -89,13 +89,11 @@ def depth_video(images: Iterable[NDArray[np.float32]], *, fps: int) -> tuple[Enc
     packets: list[av.Packet] = []
     counts = np.zeros(LARGEST_CODE + 1, dtype=np.int64)
     number = 0
-    height = width = 0
     for number, image in enumerate(images, start=1):
         codes = quantised(image)
-        height, width = codes.shape
         counts += np.bincount(codes.ravel(), minlength=LARGEST_CODE + 1)
         if context is None:
-            context = _encoder(width, height, fps)
+            context = _encoder(codes.shape, fps)
         frame = av.VideoFrame.from_ndarray(codes, format="gray12le")
         frame.pts, frame.time_base = number - 1, context.time_base
         packets += context.encode(frame)
@@ -103,16 +101,17 @@ def depth_video(images: Iterable[NDArray[np.float32]], *, fps: int) -> tuple[Enc
         raise ExportError("No depth images to encode.")
     packets += context.encode(None)
     data = [bytes(packet) for packet in packets]
-    video = EncodedVideo.of_access_units("hevc", width, height, b"".join(data), [len(unit) for unit in data])
+    video = EncodedVideo.of_access_units("hevc", b"".join(data), [len(unit) for unit in data])
     video = replace(video, is_keyframe=np.array([packet.is_keyframe for packet in packets], dtype=np.bool_))
     histogram = PixelHistogram(counts=counts[np.newaxis], level_values=DepthScale().values(), num_images=number)
     return video, histogram
 
 
-def _encoder(width: int, height: int, fps: int) -> av.VideoCodecContext:
+def _encoder(shape: tuple[int, ...], fps: int) -> av.VideoCodecContext:
     try:
         context = cast(av.VideoCodecContext, av.CodecContext.create("libx265", "w"))
-        context.width, context.height, context.pix_fmt = width, height, "gray12le"
+        context.height, context.width = shape
+        context.pix_fmt = "gray12le"
         context.time_base, context.framerate = Fraction(1, fps), Fraction(fps, 1)
         # No reordering and no log output; every keyframe is independent. One thread and no encoder settings in the
         # stream: both depend on the machine, and equal images must give equal bytes on every machine.

@@ -46,8 +46,6 @@ class EncodedVideo:
     """
 
     codec: str
-    width: int
-    height: int
     first: bytes
     samples: bytes | Path
     sizes: NDArray[np.int64]
@@ -59,7 +57,7 @@ class EncodedVideo:
 
     @classmethod
     def of_access_units(
-        cls, codec: str, width: int, height: int, data: bytes, lengths: Sequence[int] | NDArray[np.int64], lead: int = 0
+        cls, codec: str, data: bytes, lengths: Sequence[int] | NDArray[np.int64], lead: int = 0
     ) -> EncodedVideo:
         """Build from concatenated access units and their lengths; ExportError if they are invalid."""
         ends = np.cumsum(np.asarray(lengths, dtype=np.int64)).tolist()
@@ -71,8 +69,6 @@ class EncodedVideo:
         keyframes = [any(kind in _KEYFRAMES[codec] for kind, _ in part) for part in parts]
         video = cls(
             codec=codec,
-            width=width,
-            height=height,
             first=units[0] if units else b"",
             samples=b"".join(samples),
             sizes=np.array([len(sample) for sample in samples], dtype=np.int64),

@@ -251,7 +251,7 @@ def _transcoded_video(episode: LeRobotEpisode, camera: ExportCamera) -> tuple[En
     units += encoder.finish()
     lengths = [len(unit) for unit in units]
     codec = _mp4_codec(encoder.settings)
-    return EncodedVideo.of_access_units(codec, size.width, size.height, b"".join(units), lengths), encoder.settings
+    return EncodedVideo.of_access_units(codec, b"".join(units), lengths), encoder.settings
 
 
 def recorded_videos(episode: LeRobotEpisode, cameras: Sequence[ExportCamera]) -> dict[str, EncodedVideo]:
@@ -267,9 +267,7 @@ def recorded_videos(episode: LeRobotEpisode, cameras: Sequence[ExportCamera]) ->
         if lead or len(block) != len(numbers):
             taken = np.arange(numbers[0] - lead, numbers[-1] + 1) if is_whole else numbers
             block = block.select(taken.astype(np.intp))
-        video = EncodedVideo.of_access_units(
-            _mp4_codec(settings), settings.width, settings.height, block.joined(), block.lengths, lead
-        )
+        video = EncodedVideo.of_access_units(_mp4_codec(settings), block.joined(), block.lengths, lead)
         if not is_whole and not video.is_keyframe.all():
             raise ExportError(
                 f"The recording lists every {_ordinal(settings.gop)} image of camera {camera.name} as a keyframe, "

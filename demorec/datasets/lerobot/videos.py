@@ -209,8 +209,6 @@ class EpisodeVideo:
         shifts = part.places - np.arange(len(part.places))
         return EncodedVideo(
             codec=file.codec_name,
-            width=file.size[0],
-            height=file.size[1],
             first=file.first_image(int(part.numbers[0])),
             samples=b"".join(file.samples(part.numbers)),
             sizes=file.sizes[part.numbers],

@@ -124,7 +124,7 @@ class _ContentReader:
 
     def _packets(self, name: str, number: int) -> bytes:
         video = self.folder.video(name, self.folder.places[number]).cut()
-        head = f"{video.codec} {video.width} {video.height} {video.lead} {video.tail} {video.sizes.tolist()}"
+        head = f"{video.codec} {video.lead} {video.tail} {video.sizes.tolist()}"
         return hashlib.sha256(b"".join((head.encode(), video.parameter_sets(), video.read()))).digest()
 
 
