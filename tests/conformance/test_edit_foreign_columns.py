@@ -168,7 +168,7 @@ def test_doubles_under_float32_are_named_and_imported(tmp_path: Path, capsys: py
 
 
 def test_videos_of_other_encoders_are_imported_and_viewed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = write_drawn(tmp_path / "set", replace(PLAIN, camera="mpeg4", is_fragmented=True))
+    source = write_drawn(tmp_path / "set", replace(PLAIN, camera="mpeg4"))
     assert exit_code("import", "lerobot", source, "--out", tmp_path / "run") == 0, capsys.readouterr().err
     assert "mpeg4, encoded once" in capsys.readouterr().out
     with av.open(str(min(source.glob("videos/**/*.mp4")))) as container:
@@ -178,6 +178,14 @@ def test_videos_of_other_encoders_are_imported_and_viewed(tmp_path: Path, capsys
     assert len(images) == len(shown)
     assert np.abs(np.stack(images).astype(float) - np.stack(shown)).mean() < 6
     assert exit_code("view", source, "--episodes", "1", "--save", tmp_path / "x.rrd") == 0
+
+
+def test_a_video_in_fragments_is_refused_with_a_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = write_drawn(tmp_path / "set", PLAIN)
+    path = min(source.glob("videos/**/*.mp4"))
+    path.write_bytes(encoded("h264", PLAIN.lengths[0], 3, is_fragmented=True))
+    assert exit_code("view", source, "--episodes", "0", "--save", tmp_path / "x.rrd") == 1
+    assert "ffmpeg -i FILE -c copy NEW.mp4 joins them" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize("dtype", ["absent", "float64"])
@@ -331,7 +339,7 @@ def test_a_file_with_too_few_images_is_named_for_all_of_its_episodes(
     (path,) = source.rglob("*.mp4")
     assert exit_code("info", source) == 0
     assert "images for" not in capsys.readouterr().out
-    path.write_bytes(encoded("h264", 13, 3, False))
+    path.write_bytes(encoded("h264", 13, 3))
     told = (
         f"{path.relative_to(source).as_posix()} has 13 images for 15 rows of episodes 0 to 2: after the first missing"
     )

@@ -47,14 +47,12 @@ def command(*words: object) -> tuple[int, str, str]:
 
 @pytest.mark.slow
 @settings(max_examples=8, **FEW)  # type: ignore[arg-type]
-@given(kind=KINDS, version=st.sampled_from(["v2.1", "v3.0"]), gop=st.sampled_from([1, 3]), is_fragmented=st.booleans())
+@given(kind=KINDS, version=st.sampled_from(["v2.1", "v3.0"]), gop=st.sampled_from([1, 3]))
 def test_the_pixel_format_decides_what_a_video_of_a_dataset_holds(
-    kind: tuple[str, str], version: str, gop: int, is_fragmented: bool
+    kind: tuple[str, str], version: str, gop: int
 ) -> None:
     codec, pixels = kind
-    drawn = replace(
-        PLAIN, is_variable=False, camera=codec, pixels=pixels, version=version, gop=gop, is_fragmented=is_fragmented
-    )
+    drawn = replace(PLAIN, is_variable=False, camera=codec, pixels=pixels, version=version, gop=gop)
     with tempfile.TemporaryDirectory() as folder:
         source, run = write_drawn(Path(folder) / "set", drawn), Path(folder) / "run"
         with av.open(str(next(source.rglob("*.mp4")))) as file:

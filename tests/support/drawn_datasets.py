@@ -47,7 +47,6 @@ class DrawnDataset:
         pixels: Pixel format of videos.
         camera: A codec, "image" (structs in rows), "binary" (plain bytes in rows) or "" for none.
         gop: Frames from one keyframe to the next.
-        is_fragmented: Whether videos are in fragments.
         reference: NumPy's type of a column of numbers of tasks; "" for none.
         missing: Counters that the data files and info.json lack.
         num_files: Data files of a dataset of v3.0.
@@ -65,7 +64,6 @@ class DrawnDataset:
     time_type: str
     camera: str
     gop: int
-    is_fragmented: bool
     reference: str
     missing: tuple[str, ...]
     num_files: int
@@ -91,7 +89,6 @@ DRAWN = st.builds(
     time_type=st.sampled_from(["float32", "float64"]),
     camera=st.sampled_from(["", "image", "binary", "h264", "hevc", "av1", "mpeg4"]),
     gop=st.sampled_from([1, 3, 100]),
-    is_fragmented=st.booleans(),
     reference=st.sampled_from(["", "int64", "int32", "uint8"]),
     missing=st.sampled_from([(), ("frame_index",), ("index", "task_index"), ("timestamp",)]),
     num_files=st.integers(1, 3),
@@ -102,7 +99,7 @@ DRAWN = st.builds(
 
 PLAIN = DrawnDataset(
     version="v2.1", lengths=(5, 6), names="list", stored="float32", claimed="float32", is_variable=True, clock="grid",
-    time_type="float32", camera="h264", gop=3, is_fragmented=False, reference="", missing=(), num_files=1, extra=(),
+    time_type="float32", camera="h264", gop=3, reference="", missing=(), num_files=1, extra=(),
     has_unlisted=False,
 )  # fmt: skip
 
@@ -246,11 +243,11 @@ def _write_videos(root: Path, drawn: DrawnDataset) -> dict[str, Any]:
         for number, length in enumerate(drawn.lengths):
             path = root / f"videos/chunk-000/{TOP}/episode_{number:06d}.mp4"
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(encoded(drawn.camera, length, drawn.gop, drawn.is_fragmented, drawn.pixels))
+            path.write_bytes(encoded(drawn.camera, length, drawn.gop, drawn.pixels))
         return {}
     path = root / f"videos/{TOP}/chunk-000/file-000.mp4"
     path.parent.mkdir(parents=True)
-    path.write_bytes(encoded(drawn.camera, drawn.total, drawn.gop, drawn.is_fragmented, drawn.pixels))
+    path.write_bytes(encoded(drawn.camera, drawn.total, drawn.gop, drawn.pixels))
     begins = np.cumsum([0, *drawn.lengths]) / drawn.fps
     zeros = [0] * len(drawn.lengths)
     columns = {"chunk_index": zeros, "file_index": zeros, "from_timestamp": begins[:-1], "to_timestamp": begins[1:]}
@@ -258,7 +255,7 @@ def _write_videos(root: Path, drawn: DrawnDataset) -> dict[str, Any]:
 
 
 @functools.cache
-def encoded(codec: str, length: int, gop: int, is_fragmented: bool, pixels: str = "yuv420p") -> bytes:
+def encoded(codec: str, length: int, gop: int, pixels: str = "yuv420p", *, is_fragmented: bool = False) -> bytes:
     """An mp4 file of some frames at 10 Hz: a square that moves over a table."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.uint8)
     table = np.stack([2 * rows, 2 * columns, rows + columns], axis=-1)

@@ -77,7 +77,7 @@ def mp4_index(path: Path) -> Index:
             if b"moov" not in boxes:
                 raise ValueError("it has no index")
             if b"moof" in boxes:
-                return _fragmented_index(path)
+                raise ValueError("it is in fragments: ffmpeg -i FILE -c copy NEW.mp4 joins them")
             begin, end = boxes[b"moov"]
             tracks = (_flat(file, *part) for kind, *part in _boxes(file, begin, end) if kind == b"trak")
             track = next((track for track in tracks if track.get(b"hdlr", b"")[8:12] == b"vide"), None)
@@ -86,26 +86,6 @@ def mp4_index(path: Path) -> Index:
             return _index(track, size)
     except (OSError, EOFError, ValueError, KeyError, IndexError, struct.error) as error:
         raise ExportError(f"The video cannot be read ({describe_error(error)}): {path}") from error
-
-
-def _fragmented_index(path: Path) -> Index:
-    """Read the index of a fragmented file (`moof`), with tables in each fragment, from libav's packets."""
-    import av  # the index of other files needs no libav
-
-    found: list[tuple[int, int, bool, int]] = []
-    try:
-        with av.open(str(path), format="mp4") as container:
-            stream = container.streams.video[0]
-            for packet in container.demux(stream):
-                if packet.size:
-                    if packet.pos is None or packet.pts is None:
-                        raise ValueError("an image has no place or time")
-                    found.append((packet.pos, packet.size, packet.is_keyframe, packet.pts))
-            time_base = float(stream.time_base or 0)
-    except av.FFmpegError as error:
-        raise ValueError(describe_error(error)) from error
-    offsets, sizes, are_keyframes, ticks = np.array(found, dtype=np.int64).reshape(-1, 4).T
-    return offsets, sizes, are_keyframes.astype(np.bool_), (ticks * time_base).astype(np.float64)
 
 
 def _index(track: Mapping[bytes, bytes], size: int) -> Index:
