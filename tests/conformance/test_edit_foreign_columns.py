@@ -18,8 +18,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
+from support.check import edit_parquet
 from support.commands import exit_code
-from support.drawn_datasets import PLAIN, STATE, encoded, write_drawn
+from support.drawn_datasets import PLAIN, STATE, TOP, encoded, write_drawn
 from support.export import data_table, recordings
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 from support.stored_episodes import task_texts
@@ -142,6 +143,16 @@ def test_a_cut_keeps_the_stages_within_it(tmp_path: Path) -> None:
     found = [row[f"sparse_subtask_{name}"] for name in stages]
     assert found[:3] == [["grasp", "lift"], [0, 2], [1, 2]]
     np.testing.assert_allclose(found[3:], [[0, 0.2], [0.2, 0.3]], atol=1e-9)
+
+
+def test_another_image_in_a_row_is_a_difference(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = write_drawn(tmp_path / "a", replace(PLAIN, camera="image", version="v3.0"))
+    other = shutil.copytree(source, tmp_path / "b")
+    assert exit_code("dataset", "diff", source, other) == 0
+    path = next(other.glob("data/*/*.parquet"))
+    edit_parquet(path, TOP, lambda images: [*images[:2], images[3], *images[3:]])
+    assert exit_code("dataset", "diff", source, other) == 1
+    assert f"episode 0: {TOP} differs in 1 of 5 frames, first in frame 2" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("begin_s", [0.0, 10.0, 1500.0, 3000.0])
