@@ -21,12 +21,11 @@ from pathlib import Path
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.extensions.remake.deep_check import deep_check
-from demorec.extensions.remake.demonstration import open_file
 from demorec.extensions.remake.drive import replay_all
 from demorec.extensions.remake.options import RerenderOptions
 from demorec.extensions.remake.rerender import rerender
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
-from demorec.mcap import EpisodeWriter
+from demorec.mcap import EpisodeWriter, Recording
 from demorec.render.painter import WarmRenderer
 
 SMALL = RerenderOptions(cameras=("front",), width=96, height=96)
@@ -53,7 +52,8 @@ def steps(path: Path, config: GenerateConfig, index: int, warm: Warm) -> Iterato
     yield "generate", True
     yield "check", check_subject(Subject(path=path, kind="recording"), CheckOptions()).verdict == "good"
     yield "deep", deep_check(path, warm.remakes).level == "pass"
-    (report,) = replay_all([open_file(path)])
+    with Recording(path) as recording:
+        (report,) = replay_all([recording])
     yield "replay", report.is_identical
     if config.cameras:
         for name, options in (("render", RerenderOptions()), ("render 96x96", SMALL)):

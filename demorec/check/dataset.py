@@ -149,7 +149,7 @@ def run_dataset(run: CheckedRun) -> Iterator[Fault]:
     if not dataset.records or any(row["source"] is None for row in dataset.records):
         return listed(["the dataset does not name its source recordings"])
     dataset.check_simulated()
-    options = export_options(path)
+    options = _export_options(path)
     wrong = list(dict.fromkeys(dataset.unreadable.values()))
     successes = len(run.run.successes)
     found = sum(bool(row["success"]) for row in dataset.records)
@@ -158,12 +158,12 @@ def run_dataset(run: CheckedRun) -> Iterator[Fault]:
     for episode in dataset.described():
         folder = run.path / (EPISODES if episode.kept["success"] else FAILED)
         file = folder / Path(str(episode.kept["source"])).name
-        if words := [what for what, _ in episode_differences(file, options, episode, dataset)]:
-            wrong.append(f"episode {episode.number}: {', '.join(words)}")
+        if words := ", ".join(_episode_differences(file, options, episode, dataset)):
+            wrong.append(f"episode {episode.number}: {words}")
     return listed(wrong)
 
 
-def export_options(dataset: Path) -> ExportOptions:
+def _export_options(dataset: Path) -> ExportOptions:
     """Options with which a dataset was exported, as far as they decide its episodes.
 
     Raises:
@@ -180,10 +180,10 @@ def export_options(dataset: Path) -> ExportOptions:
     return options
 
 
-def episode_differences(
+def _episode_differences(
     recording_file: Path, options: ExportOptions, episode: DescribedEpisode, dataset: CheckedDataset
-) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Yield (feature, frames) for each difference between an episode and its recording exported with the same options.
+) -> Iterator[str]:
+    """Yield the features in which an episode differs from its recording exported with the same options.
 
     Raises:
         ExportError: A video of the dataset cannot be read.
@@ -197,26 +197,24 @@ def episode_differences(
             reasons = reasons_to_transcode(expected)
             recorded = recorded_videos(expected, [camera for camera, reason in reasons.items() if not reason])
     except RecordingError as error:
-        yield str(error), ()
+        yield str(error)
         return
     except DemorecError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        yield f"its recording cannot be exported as this episode ({describe_error(error)})", ()
+        yield f"its recording cannot be exported as this episode ({describe_error(error)})"
         return
     place = dataset.listed[episode.number]
     if place.tasks != (expected.info.instruction,):
-        yield "instruction", ()
+        yield "instruction"
     for name, values in columns.items():
-        found, true = episode.rows.get(name), values.reshape(len(values), -1)
-        if found is None or found.shape != true.shape:
-            yield name, ()
-        elif len(frames := np.flatnonzero((found != true).any(axis=1))):
-            yield name, tuple(frames.tolist())
+        found = episode.rows.get(name)
+        if found is None or not np.array_equal(found, values.reshape(len(values), -1)):
+            yield name
     videos = video_digests(dataset, place)
     for key, video in recorded.items():
         if videos.get(key) != video.digest:
-            yield key, ()
+            yield key
     for name, value in record.row.items():
         if name not in _OF_THE_PLACE and episode.kept.get(name) != value:
-            yield f"sidecar's {name}", ()
+            yield f"sidecar's {name}"

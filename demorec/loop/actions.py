@@ -39,23 +39,16 @@ def action_bounds(robot: RobotSpec, kind: ActionKind, *, fps: int) -> tuple[NDAr
 class ActionDecoder:
     """Decoder of one episode's actions into commands, starting from the world's current targets.
 
-    An unreachable pose keeps the last joint targets.
+    Each command is clamped to the joint limits in position and velocity (from the last command) and to the gripper's
+    opening; the elbow is pulled towards the expert's posture. An unreachable pose keeps the last joint targets, and
+    deltas continue from the last pose that was reached.
 
     Args:
         world: World at the episode's start.
         kind: Meaning of the actions (`demorec.episode.features.action_vectors`).
-        is_limited: True for a policy's actions: each command is clamped to the joint limits in position and velocity
-            (from the last command) and to the gripper's opening, the elbow is pulled towards the expert's posture, and
-            deltas continue from the last pose that was reached. False for recorded actions, which are sent unchanged so
-            that a replay shows their effect.
-
-    Attributes:
-        num_unreachable: Poses that inverse kinematics has failed to reach.
     """
 
-    def __init__(self, world: World, kind: ActionKind, *, is_limited: bool = True) -> None:
-        self.num_unreachable = 0
-        self._is_limited = is_limited
+    def __init__(self, world: World, kind: ActionKind) -> None:
         self._robot, self._arm, self._kinematics, self._kind = world.robot, world.arm, world.arm.kinematics, kind
         self._max_step = np.array(world.robot.velocity_limit) / world.fps
         self._joint_target: Array = world.arm.target.copy()
@@ -64,11 +57,9 @@ class ActionDecoder:
 
     def command(self, values: Array) -> Action:
         """Decode an action (D,), float64, into a command."""
-        wanted, gripper = self._wanted(values), float(values[-1])
-        if self._is_limited:
-            wanted = np.clip(wanted, self._kinematics.lower, self._kinematics.upper)
-            wanted = np.clip(wanted, self._joint_target - self._max_step, self._joint_target + self._max_step)
-            gripper = float(np.clip(gripper, 0.0, self._robot.gripper.max_width))
+        wanted = np.clip(self._wanted(values), self._kinematics.lower, self._kinematics.upper)
+        wanted = np.clip(wanted, self._joint_target - self._max_step, self._joint_target + self._max_step)
+        gripper = float(np.clip(values[-1], 0.0, self._robot.gripper.max_width))
         self._joint_target = wanted
         self._given = self._arm.action(wanted, gripper)
         return self._given
@@ -87,15 +78,11 @@ class ActionDecoder:
             self._tcp_target = features.pose_from_delta(self._tcp_target, values)
         else:
             self._tcp_target = _pose(values[:7], otherwise=self._tcp_target)
-        rest = None
-        if self._is_limited:
-            rest = self._kinematics.turned_towards(np.array(self._robot.home_q), self._tcp_target.position)
+        rest = self._kinematics.turned_towards(np.array(self._robot.home_q), self._tcp_target.position)
         found = self._kinematics.inverse(self._tcp_target, start=self._joint_target, rest=rest, null_gain=NULL_GAIN)
         if found is None:
-            self.num_unreachable += 1
             found = self._joint_target
-            if self._is_limited:
-                self._tcp_target = self._kinematics.forward(found)
+            self._tcp_target = self._kinematics.forward(found)
         return found
 
 

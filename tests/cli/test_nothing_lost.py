@@ -364,11 +364,8 @@ def test_the_output_of_another_recovery_stays(full: Path) -> None:
     assert files_of(full) == before
 
 
-@pytest.mark.parametrize("command", ["render", "replay"])
-def test_render_and_replay_never_replace_their_inputs(
-    place: Path, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
-    """The command refuses before it simulates or renders, so stand-in recordings suffice."""
+def test_render_never_replaces_its_inputs(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The command refuses before it renders, so stand-in recordings suffice."""
     copy = place / "copy"
     copy.mkdir()
     shutil.copy(place / "alone.mcap", copy / "alone.mcap")
@@ -385,13 +382,13 @@ def test_render_and_replay_never_replace_their_inputs(
         ((place / "runs/run",), place / "runs/run/new"),
         ((place / "runs/run/episodes/episode_000000.mcap",), place / "runs/run"),
     ):
-        assert exit_code(command, *sources, "--out", out, "--overwrite") == 2
+        assert exit_code("render", *sources, "--out", out, "--overwrite") == 2
         assert "of this command" in capsys.readouterr().err
     assert files_of(place.parent) == before
 
 
 def test_a_recording_replaces_recordings_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Test the writer that render, replay and evaluate share."""
+    """Test the writer that render and evaluate share."""
     info, _, _ = make_episode(num_frames=1, cameras=())
     before = files_of(place.parent)
     for target in ("thesis.tex", "thesis", "dataset", "link_to_thesis"):
@@ -410,7 +407,6 @@ INSIDE: dict[str, Sequence[str]] = {
     "view alone.mcap --save": ("runs/other/episodes/v.rrd", "runs/other/failed/v.rrd", "dataset/data/v.rrd"),
     "report alone.mcap --out": ("runs/other/episodes/v.html", "dataset/v.html"),
     "render alone.mcap --out": ("runs/other/episodes", "dataset", "evaluation/failed", "runs/other/episodes/x.mcap"),
-    "replay alone.mcap --out": ("runs/other/episodes", "dataset/deep/er", "evaluation/failed"),
     "import lerobot dataset --out": PARTS,
     **{f"export {exporter} alone.mcap --out": (*PARTS, "dataset/a/b") for exporter in EXPORTERS.names()},
 }

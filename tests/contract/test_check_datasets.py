@@ -278,21 +278,6 @@ def test_statistics_of_row_numbers_are_not_judged(dataset: Path) -> None:
     assert verdict_of(dataset, "wrong_statistics", "dataset") == "good"
 
 
-@pytest.mark.slow
-def test_deep_makes_the_episodes_of_a_dataset_again(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ("check", dataset, "--deep", "--only", "unreadable_episodes")
-    assert exit_code(*command) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len([line for line in lines if "the same to the bit" in line]) == 3
-    value_of("observation.velocity", 20, 0.123)(dataset)
-    value_of("failure_reason", 1, "bad luck", "demorec/episodes")(dataset)
-    assert exit_code(*command) == 1
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines if "made again" in line][:3] == ["fail", "fail", "pass"]
-    assert any("observation.velocity at frame 20" in line for line in lines)
-    assert any("sidecar's failure_reason" in line for line in lines)
-
-
 def test_a_recording_with_nan_is_not_exported(tmp_path: Path) -> None:
     source, seen = simulate(tmp_path / "a.mcap", fps=10), 0
 

@@ -25,7 +25,6 @@ from demorec.extensions.policies.evaluation import Evaluation, Settings
 from demorec.extensions.policies.gym_env import DemorecEnv
 from demorec.extensions.policies.rollouts import make_rollout
 from demorec.extensions.policies.turns import Turns, read_takeover
-from demorec.extensions.remake.demonstration import open_file
 from demorec.extensions.remake.drive import replay_all
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
@@ -89,6 +88,7 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
     assert attempt.success
     with Recording(path) as recording:
         phases = recording.phases
+        (report,) = replay_all([recording])
         assert recording.info.origin == "correction of lazy 0"
         assert recording.info.simulated.behaviour["action_noise"] == 0.0
         assert recording.outcome is not None
@@ -102,7 +102,6 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
     taken = read_takeover(path)
     assert taken is not None
     assert (taken.reason, taken.num_frames) == ("the policy is stuck", len(phases) - handover)
-    (report,) = replay_all([open_file(path)])
     assert report.is_identical, report
 
 
@@ -203,6 +202,7 @@ def test_a_deviating_policy_is_corrected_and_the_episode_replays(expert_poses: A
     with Recording(path) as recording:
         trajectory = recording.trajectory()
         assert recording.info.simulated.behaviour["action_noise"] > 0.0
+        (report,) = replay_all([recording])
     handover = trajectory.phase.index("halt")
     assert handover in range(29, 34)
     assert set(trajectory.phase[:handover]) == {POLICY_PHASE}
@@ -213,5 +213,4 @@ def test_a_deviating_policy_is_corrected_and_the_episode_replays(expert_poses: A
     differs = (trajectory.action_joint_target != trajectory.command_joint_target).any(axis=1)
     assert not differs[:handover].any()
     assert differs[handover:].any()
-    (report,) = replay_all([open_file(path)])
     assert report.is_identical, report

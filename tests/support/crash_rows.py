@@ -151,13 +151,6 @@ ROWS = {
         targets=("new.rrd",),
         old="view SOURCES/run --episodes 1 --save new.rrd",
     ),
-    "replay": Row(
-        call="replay SOURCES/e.mcap --out new",
-        targets=("new/*.mcap",),
-        needs=(SIMULATED,),
-        surprise="new/e.mcap",
-        resumes=True,
-    ),
     "render": Row(
         call="render SOURCES/e.mcap --cameras front --workers 1 --out new.mcap",
         targets=("new.mcap",),

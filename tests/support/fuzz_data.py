@@ -233,7 +233,7 @@ class Fuzzed:
         _change(root / "meta" / "info.json" if chance.random() < 0.4 else file, chance)
         commands: tuple[Words, ...] = (
             ["info", root], ["import", "lerobot", root, "--out", self.folder / "out"],
-            ["check", root], ["report", root, "--out", self.folder / "out.html"], ["replay", root],
+            ["check", root], ["report", root, "--out", self.folder / "out.html"],
             ["export", "lerobot", self._good, "--out", root, "--append", "--no-verify"],
             ["view", root, "--save", self.folder / "out.rrd"],
             ["generate", "--config", root, "--out", self.folder / "out", "--workers", "0"],

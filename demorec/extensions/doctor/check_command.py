@@ -6,7 +6,6 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,8 +72,8 @@ class CheckCommand:
     lerobot: bool = False
     """Also open each dataset with the installed LeRobot, which takes seconds."""
     deep: bool = False
-    """Also remake every recording, and every episode of a dataset, from config and seed, and compare every number and
-    image; takes about as long as generating them."""
+    """Also remake every recording from config and seed, and compare every number and image; takes about as long as
+    generating them."""
     workers: int | None = None
     """Number of processes that check the files of recordings (auto: one per core, or one if starting them would take
     longer than the checks)."""
@@ -100,6 +99,8 @@ class CheckCommand:
         leave_pandas_out()
         integrity, chosen = split_checks(self.only)
         subjects = find_subjects(self.paths)
+        if self.deep and all(subject.kind == "dataset" for subject in subjects):
+            raise ConfigError(f"--deep remakes recordings, name the run of this dataset: {self.paths[0]}")
         files = subjects if integrity or not self.only else []
         workers = self.workers
         if workers is None:
@@ -169,17 +170,11 @@ class CheckCommand:
         return text
 
     def _remade(self, subjects: Sequence[Subject], workers: int) -> Iterator[DeepReport]:
-        from demorec.extensions.remake.deep_check import deep_checks, deep_dataset_checks
+        from demorec.extensions.remake.deep_check import deep_checks
 
-        allowed = allowed_modules(self.allow)
         paths = [subject.path for subject in subjects if subject.kind == "recording"]
-        # Their datasets contain the same episodes.
-        runs = [subject.path for subject in subjects if subject.kind == "run"]
-        datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
-        found = [deep_checks(paths, workers=workers, allowed=allowed)]
-        found += [deep_dataset_checks(path, allowed=allowed) for path in datasets]
-        with ProgressBar("making again", total=0 if datasets else len(paths)) as bar:
-            for report in chain.from_iterable(found):
+        with ProgressBar("making again", total=len(paths)) as bar:
+            for report in deep_checks(paths, workers=workers, allowed=allowed_modules(self.allow)):
                 bar.advance()
                 if not self.json:
                     say(*deep_lines(report, verbose=self.all))

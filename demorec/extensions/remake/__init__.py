@@ -1,6 +1,5 @@
-"""Simulate recorded actions again, as proof of a recording.
+"""Simulate recorded commands again, as proof of a recording.
 
 The world is rebuilt from the recorded scene, the recorded float64 commands are sent again, and every state is compared
-with the recorded one, bit by bit. On one type of machine there must be no difference. The same code measures whether
-an exported dataset, with float32 actions of any kind, still solves the task.
+with the recorded one, bit by bit. On one type of machine there must be no difference.
 """

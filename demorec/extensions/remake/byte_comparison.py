@@ -38,8 +38,7 @@ class RemakeDifference:
         field: Message field such as `pose.position.x`, or metadata field such as
         `info.simulation.scene.bodies[1].mass`.
         frames: Frames that differ, ascending; empty outside frames.
-        recorded, again: Recorded and remade value at the first of these frames, in words; `again` is "" if `recorded`
-        describes both.
+        recorded, again: Recorded and remade value at the first of these frames, in words.
     """
 
     stream: str
@@ -54,8 +53,6 @@ class RemakeDifference:
             where += f" at frame {self.frames[0]}"
             if len(self.frames) > 1:
                 where += f" (and {len(self.frames) - 1} more, the last is {self.frames[-1]})"
-        if not self.again:
-            return f"{where}: {self.recorded}"
         return f"{where}: {self.recorded} is recorded, made again it is {self.again}"
 
 

@@ -1,6 +1,6 @@
-"""`demorec check --deep`: remake a recording, or an episode of a dataset, from its description, and compare every byte.
+"""`demorec check --deep`: remake a recording from its description, and compare every byte.
 
-The script runs again from config and seed; for a derived recording (a replay, a render) the commands are sent again.
+The script runs again from config and seed; for a derived recording (a render, a rollout) the commands are sent again.
 Differences are reported by stream, field and frame. This finds every error in a recording of demorec except errors that
 the program itself reproduces.
 """
@@ -15,24 +15,21 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from demorec.check.dataset import CheckedDataset, DescribedEpisode, episode_differences, export_options
 from demorec.check.report import Proof
-from demorec.core.config import EpisodePlan, GenerateConfig, cpu_type, deciding_versions
-from demorec.core.errors import ConfigError, DemorecError, ExportError, NotAllowedError, RecordingError, resource_error
+from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig, cpu_type, deciding_versions
+from demorec.core.errors import DemorecError, NotAllowedError, RecordingError, resource_error
 from demorec.core.own_versions import version_differences
 from demorec.core.plain import digest
 from demorec.core.processes import in_turn
-from demorec.datasets.lerobot.options import ExportOptions
-from demorec.episode.episode import Outcome
+from demorec.core.tables import RENDERERS
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import with_simulation
 from demorec.extensions.remake.byte_comparison import Contents, RemakeDifference, content_differences
-from demorec.extensions.remake.demonstration import open_demonstration
-from demorec.extensions.remake.drive import record_replay
-from demorec.extensions.remake.rerender import config_as
+from demorec.extensions.remake.drive import replay
+from demorec.extensions.remake.rerender import config_as, recorded_view, view_painter
 from demorec.generate.worker import record_episode
 from demorec.loop import SimulatorCache
-from demorec.mcap import Recording, open_simulated
+from demorec.mcap import EpisodeWriter, Recording, open_simulated
 from demorec.robots.assets import allow_models
 
 
@@ -146,35 +143,35 @@ def remake(recording: Recording, path: Path, simulators: SimulatorCache, allowed
         ConfigError: Its config cannot be used.
         DemorecError: It cannot be simulated, drawn or written here.
     """
-    if recording.info.origin:
+    info = recording.info
+    if info.origin:
         _send_again(recording, path, simulators, allowed)
-    else:
-        _generate_again(recording.info, path, simulators, allowed)
-
-
-def _generate_again(info: EpisodeInfo, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
+        return
     config = _recorded_config(info, allowed)
     plan = EpisodePlan(config=config, episode_index=info.episode_index, attempt=info.attempt)
     record_episode(plan, path, simulators)
 
 
 def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
+    """Replay the commands into a new recording, with images of the recorded cameras."""
     allow_models(allowed)
-    recorded = recording.outcome
     info = with_simulation(recording.info, config_digest=digest(recording.info.simulated.config))
-
-    def labelled(outcome: Outcome) -> Outcome:
-        if recorded is None:
-            return outcome
-        return replace(  # a replay cannot reproduce the reason of a failure or the number of retries
-            outcome,
-            failure_phase=recorded.failure_phase,
-            failure_reason=recorded.failure_reason,
-            num_retries=recorded.num_retries,
-            success=all(check.passed for check in outcome.checks) and not recorded.failure_reason,
-        )
-
-    record_replay(open_demonstration(recording), info, path, simulators, allowed, labelled=labelled)
+    config, recorded = info.simulated.config, recording.outcome
+    RENDERERS.check_name(str(config.get("renderer", "raster")))
+    world, renderer = simulators.acquire(info)
+    painter = None if renderer is None else view_painter(renderer, recorded_view(info), config)
+    video = config_as(config.get("video", {}), VideoConfig)
+    with EpisodeWriter(path, info, video=video) as writer:
+        _, outcome = replay(recording, world, allowed, painter=painter, sink=writer.write)
+        if recorded is not None:  # a replay cannot reproduce the reason of a failure or the number of retries
+            outcome = replace(
+                outcome,
+                failure_phase=recorded.failure_phase,
+                failure_reason=recorded.failure_reason,
+                num_retries=recorded.num_retries,
+                success=all(check.passed for check in outcome.checks) and not recorded.failure_reason,
+            )
+        writer.finish(outcome)
 
 
 def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
@@ -194,59 +191,3 @@ def proofs(paths: Sequence[Path], allowed: Sequence[str]) -> Iterator[Proof]:
         if report.level == "fail":
             problem = f"made again, it is not the same: {report.error or report.differences[0]}"
         yield Proof(path=report.path, level=report.level, problem=problem)
-
-
-def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
-    """One report per episode in the sidecar, in order; a single one if that is impossible.
-
-    Each episode is remade from its row of the sidecar, exported, and compared.
-
-    Raises:
-        ResourceError: This machine lacks resources; this implies nothing about the dataset.
-    """
-    with closing(SimulatorCache()) as simulators:
-        try:
-            dataset = CheckedDataset(path)
-            if not dataset.records:
-                raise ConfigError(
-                    f"The dataset does not record how its episodes were made (no demorec/episodes): {path}"
-                )
-            dataset.check_simulated()
-            options = export_options(path)
-            if missing := dataset.missing:
-                raise ExportError(missing)
-            for number, problem in dataset.unreadable.items():
-                yield _impossible(DeepReport(path=path / f"episode {number}"), ExportError(problem))
-            for episode in dataset.described():
-                info = episode.info
-                report = DeepReport(
-                    path=path / f"episode {episode.number}",
-                    versions=_unlike_here(info, allowed),
-                    num_frames=len(episode.rows["index"]),
-                )
-                try:
-                    found = tuple(_episode_differences(episode, dataset, options, simulators, allowed))
-                    yield replace(report, differences=found)
-                except DemorecError as error:
-                    yield _impossible(report, error)
-        except DemorecError as error:
-            yield _impossible(DeepReport(path=path), error)
-
-
-def _episode_differences(
-    episode: DescribedEpisode,
-    dataset: CheckedDataset,
-    options: ExportOptions,
-    simulators: SimulatorCache,
-    allowed: Sequence[str],
-) -> Iterator[RemakeDifference]:
-    info = episode.info
-    if info.origin:
-        raise ConfigError(f"Its recording was derived ({info.origin}), and a dataset does not store its commands.")
-    with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder:
-        again = Path(folder) / "again.mcap"
-        _generate_again(info, again, simulators, allowed)
-        for what, frames in episode_differences(again, options, episode, dataset):
-            yield RemakeDifference(
-                stream="dataset", field=what, frames=frames, recorded="differs from the remake", again=""
-            )
