@@ -24,7 +24,7 @@ def recordings(out: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in sorted((out / "episodes").glob("*.mcap"))}
 
 
-@pytest.mark.parametrize("other", [("--looks", 2), ("--gop", 1), ("--cameras", "wrist")])
+@pytest.mark.parametrize("other", [("--looks", 2), ("--cameras", "wrist")])
 def test_another_request_is_refused(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], other: tuple[object, ...]
 ) -> None:

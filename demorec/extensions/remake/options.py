@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any
 
-from demorec.core.config import VideoConfig
 from demorec.core.errors import check_option, check_seed
 from demorec.core.tables import RENDERERS
 
@@ -22,40 +21,19 @@ class RerenderOptions:
     """Image height in pixels (auto: as recorded)."""
     renderer: str | None = None
     """A name from `demorec list renderers` (auto: as recorded)."""
-    antialias: bool = True
-    """Smooth edges if the recording has them (raster only)."""
     depth: bool = False
     """Add depth images if the recording has none."""
     segmentation: bool = False
     """Add segmentation images if the recording has none."""
     looks: int | None = None
     """Seed of random light, colours and textures (auto: the recorded appearance)."""
-    codec: Literal["h264", "av1", "jpeg"] | None = None
-    """Codec of the new images (auto: as recorded)."""
-    gop: int | None = None
-    """Frames from one keyframe to the next (auto: as recorded)."""
-    crf: int | None = None
-    """Constant rate factor, lower is better (auto: as recorded)."""
-    preset: str | None = None
-    """Encoder preset (auto: as recorded)."""
-    jpeg_quality: int | None = None
-    """Quality for --codec jpeg, 1 to 100, higher is better (auto: as recorded)."""
-
-    @property
-    def video(self) -> dict[str, Any]:
-        """Fields of `VideoConfig` that change."""
-        return self._given("codec", "gop", "crf", "preset", "jpeg_quality")
 
     @property
     def config(self) -> dict[str, Any]:
-        """Fields of `GenerateConfig` that change, without `video`."""
-        changes = self._given("renderer", "width", "height")
-        changes |= {name: True for name in ("depth", "segmentation") if getattr(self, name)}
-        changes |= {} if self.antialias else {"antialias": False}
-        return changes | ({"cameras": list(self.cameras)} if self.cameras else {})
-
-    def _given(self, *names: str) -> dict[str, Any]:
-        return {name: value for name in names if (value := getattr(self, name)) is not None}
+        """Fields of `GenerateConfig` that change."""
+        names = ("renderer", "width", "height", "depth", "segmentation", "cameras")
+        values = {name: getattr(self, name) for name in names}
+        return {name: list(value) if name == "cameras" else value for name, value in values.items() if value}
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values."""
@@ -64,4 +42,3 @@ class RerenderOptions:
         check_seed("looks", self.looks)
         check_option("width", self.width, 16, 8192, "pixels")
         check_option("height", self.height, 16, 8192, "pixels")
-        replace(VideoConfig(), **self.video).validate()

@@ -163,13 +163,6 @@ def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any])
     )
 
 
-def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any]:
-    """The recording's config with the changed options of its images."""
-    config = dict(info.simulated.config)
-    video = {"video": {**config.get("video", {}), **options.video}} if options.video else {}
-    return config | options.config | video
-
-
 def rerender(
     source: Path,
     out: Path,
@@ -202,7 +195,7 @@ def rerender(
         info, trajectory = recording.info, recording.trajectory()
         if trajectory.num_frames == 0:
             raise RecordingError(f"The recording has no frames: {source}")
-        view, config = new_view(info, options, allowed), drawing_config(info, options)
+        view, config = new_view(info, options, allowed), {**info.simulated.config, **options.config}
         RENDERERS.check_name(str(config.get("renderer", "raster")))
         video = config_as(config.get("video", {}), VideoConfig)
         new_info = _drawn_info(recording, view, config)
@@ -287,11 +280,7 @@ def _compare(recording: Recording, out: Path, options: RerenderOptions) -> dict[
     if options.looks is not None:
         return found
     with open_simulated(out) as new:
-        how, how_now = (
-            (c.get("renderer"), c.get("antialias", True))
-            for c in (recording.info.simulated.config, new.info.simulated.config)
-        )
-        if how != how_now:
+        if recording.info.simulated.config.get("renderer") != new.info.simulated.config.get("renderer"):
             return found
         before = {camera.name: camera for camera in recording.info.simulated.scene.cameras}
         for camera in new.info.simulated.scene.cameras:
