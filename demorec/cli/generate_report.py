@@ -78,10 +78,8 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[
         dataset_bytes = sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
         rows.append(("dataset", f"{size_in_words(dataset_bytes)} in {target} (repo id {export.repo_id})"))
     if result.made:
-        session = run.sessions[-1]
-        wall = session.wall_seconds
-        rate = sum(bool(a.success) for a in result.made) / wall * 60
-        made = f"{wall:.1f} s for making episodes with {counted(session.workers, 'worker')}, {rate:.1f} a minute"
+        rate = sum(bool(a.success) for a in result.made) / result.seconds * 60
+        made = f"{result.seconds:.1f} s for making episodes, {rate:.1f} a minute"
         rows.append(("wall time", f"{made}; export and checks are extra"))
     if aside := sorted(path.name for path in (folder / UNFINISHED).glob("*")):
         rows.append(("set aside", f"{shown(aside)} in {folder / UNFINISHED}"))

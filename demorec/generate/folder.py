@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import platform
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from demorec.core.config import GenerateConfig, cpu_type, deciding_versions
+from demorec.core.config import GenerateConfig, deciding_versions
 from demorec.core.errors import (
     ConfigError,
     DemorecError,
@@ -22,7 +21,6 @@ from demorec.core.errors import (
 from demorec.core.files import LOCK_NAME, free_name, make_folder, run_lock
 from demorec.core.own_versions import version_differences
 from demorec.core.plain import from_plain, plain_differences, to_plain
-from demorec.core.processes import available_cores
 from demorec.core.replacing import check_replaceable, delete_parts, files_below, obstacle
 from demorec.generate.contents import PARTS, RUN, Inspector, check_dataset_place, clear_scratch, recordings_of, survey
 from demorec.generate.options import RunObserver, RunOptions, RunResult
@@ -34,22 +32,10 @@ from demorec.runs.run_file import (
     Attempt,
     DamagedRunFileError,
     GeneratedRun,
-    RunSession,
     load_run_file,
     refuse_strangers,
     save_run_file,
-    utc_now,
 )
-
-
-def _machine() -> dict[str, str]:
-    """Describe the machine of a session, for human readers."""
-    return {
-        "host": platform.node(),
-        "system": platform.platform(),
-        "cpu": cpu_type(),
-        "cores": str(available_cores()),
-    }
 
 
 class RunFolder:
@@ -58,12 +44,8 @@ class RunFolder:
     def __init__(self, path: Path, run: GeneratedRun) -> None:
         self.path = path
         self.run = run
-        self.lost_workers = 0
         self._attempts = {(a.episode_index, a.attempt): a for a in run.known}
         self._made: list[Attempt] = []
-        self._earlier = run.sessions
-        self._session = RunSession(started=utc_now(), machine=_machine())
-        self._has_session = False
         self._started = time.monotonic()
         self._saved_at = -1e9
         self._save_seconds = 0.0
@@ -74,12 +56,6 @@ class RunFolder:
         done = sum(bool(a.success) for a in self._attempts.values() if a.episode_index < self.run.num_episodes)
         return f"{done} of {self.run.num_episodes} episodes are complete and kept: {self.path}"
 
-    def begin_session(self, *, executor: str, workers: int) -> None:
-        """Record the start of the work and who does it."""
-        self._has_session = True
-        self._session = replace(self._session, executor=executor, workers=workers)
-        self.save()
-
     def add(self, attempt: Attempt) -> None:
         """Add a line; saves if the last save is old enough to cost little."""
         self._attempts[attempt.episode_index, attempt.attempt] = attempt
@@ -87,22 +63,10 @@ class RunFolder:
         if time.monotonic() - self._saved_at > max(1.0, 50 * self._save_seconds):
             self.save()
 
-    def end_session(self, state: str) -> None:
-        """Record the end of the work, for any reason."""
-        self._session = replace(self._session, ended=utc_now(), state=state)
-        try:
-            self.save()
-        except GenerationError:
-            if state != "stopped":  # otherwise report the reason why it stopped
-                raise
-
     def save(self) -> None:
         """Write run.json; GenerationError if that fails."""
         start = time.monotonic()
-        wall_seconds = round(start - self._started, 3)
-        self._session = replace(self._session, wall_seconds=wall_seconds, lost_workers=self.lost_workers)
-        sessions = (*self._earlier, self._session) if self._has_session else self._earlier
-        self.run = replace(self.run, sessions=sessions).with_attempts(self._attempts.values())
+        self.run = self.run.with_attempts(self._attempts.values())
         try:
             save_run_file(self.run, self.path)
         except OSError as error:
@@ -124,7 +88,13 @@ class RunFolder:
 
     def result(self, *, interrupted: bool) -> RunResult:
         """Return the result of this session."""
-        return RunResult(folder=self.path, run=self.run, made=tuple(self._made), interrupted=interrupted)
+        return RunResult(
+            folder=self.path,
+            run=self.run,
+            made=tuple(self._made),
+            seconds=time.monotonic() - self._started,
+            interrupted=interrupted,
+        )
 
 
 @contextmanager

@@ -82,12 +82,14 @@ class RunResult:
 
     Attributes:
         folder: Folder of the run.
-        run: Known state of the run; if anything was made, its last session is this one.
+        run: Known state of the run.
         made: Attempts made in this session.
+        seconds: Its duration.
         interrupted: Whether Ctrl-C or SIGTERM ended it.
     """
 
     folder: Path
     run: GeneratedRun
     made: tuple[Attempt, ...]
+    seconds: float
     interrupted: bool

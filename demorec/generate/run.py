@@ -11,7 +11,7 @@ import signal
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
@@ -88,14 +88,14 @@ def generate(
         if config.cameras and options.executor != "ray":
             RENDERERS.load(config.renderer)().close()  # compiles the renderer before several processes would
         executor = stack.enter_context(make_executor(options, folder.path, folder.run, maker))
-        folder.begin_session(executor=options.executor, workers=executor.workers)
         progress.started(folder.run, executor.workers)
         try:
             interrupted = _Driver(folder, schedule, executor, progress).work()
         except BaseException:
-            folder.end_session("stopped")
+            with suppress(GenerationError):  # the reason why it stopped is reported
+                folder.save()
             raise
-        folder.end_session("interrupted" if interrupted else "ended")
+        folder.save()
         result = folder.result(interrupted=interrupted)
         # Whatever the executor, an incomplete run must not end as complete.
         if not interrupted and not result.run.is_complete:
@@ -224,7 +224,6 @@ class _Driver:
     def _again(self, plan: EpisodePlan, reason: str, advice: str) -> None:
         key = (plan.episode_index, plan.attempt)
         self._losses[key] += 1
-        self._folder.lost_workers += 1
         if self._losses[key] >= MAX_LOSSES:
             raise GenerationError(
                 f"Episode {plan.episode_index} failed to be made {MAX_LOSSES} times, the last time because {reason}: "

@@ -28,13 +28,11 @@ from demorec.runs.run_file import (
     Attempt,
     DamagedRunFileError,
     RunFile,
-    RunSession,
     is_external_run,
     load_any_run_file,
     recording_name,
     refuse_strangers,
     save_run_file,
-    utc_now,
 )
 
 
@@ -55,7 +53,6 @@ class ExternalFolder:
     def __init__(self, path: Path, *, recovers: bool = True) -> None:
         self.path = path
         self.recovered: list[Path] = []
-        self._session = RunSession(started=utc_now())
         self._begun_with: EpisodeInfo | None = None
         known, is_damaged = RunFile(), False
         if os.path.lexists(path / RUN_NAME):
@@ -65,7 +62,6 @@ class ExternalFolder:
                 is_damaged = True
         if recovers:
             self._recover_parts()
-        self._sessions = known.sessions
         self.planned: Sequence[str] = known.planned
         lines = {line.file: line for line in known.attempts}
         self.episodes = [self._line(file, lines) for file in sorted((path / EPISODES).glob("episode_*.mcap"))]
@@ -159,18 +155,15 @@ class ExternalFolder:
         self.episodes = sorted([*self.episodes, *lines], key=lambda line: line.episode_index)
         self.save()
 
-    def save(self, *, ended: bool = False) -> None:
-        """Write run.json if it has changed."""
+    def save(self) -> None:
+        """Write run.json, unless the run is empty."""
         if (info := self.kind() or self._begun_with) is None:
             return
-        session = replace(self._session, ended=utc_now() if ended else "")
-        sessions = (*self._sessions, session)
         run = RunFile(
             robot=info.robot_name,
             fps=info.fps,
             planned=tuple(self.planned),
             attempts=tuple(self.episodes),
-            sessions=sessions,
         )
         try:
             save_run_file(run, self.path)
@@ -213,7 +206,7 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
         try:
             yield folder
         finally:
-            folder.save(ended=True)
+            folder.save()
             if folder._begun_with is not None and not folder.episodes:
                 (path / RUN_NAME).unlink(missing_ok=True)
             if not was_there and not (path / RUN_NAME).exists():

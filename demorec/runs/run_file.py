@@ -1,7 +1,7 @@
 """run.json: identity, options and progress of a run; one line per episode, replaced atomically.
 
 The recordings are authoritative, and this file is their index: a line lost in a crash is restored from its recording.
-Options that decide the data (config, versions) are separate from those that do not (machine, times).
+It has the options that decide the data (config, versions) and no others.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import hashlib
 import json
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -78,20 +77,6 @@ _LINE = tuple(one.name for one in fields(Attempt) if one.name not in ("instructi
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunSession:
-    """One start of the command that worked on this run. Wall-clock times in UTC, ISO 8601."""
-
-    started: str
-    ended: str = ""
-    state: str = "running"
-    machine: Mapping[str, str] = field(default_factory=dict)
-    executor: str = "local"
-    workers: int = 0
-    wall_seconds: float = 0.0
-    lost_workers: int = 0
-
-
-@dataclass(frozen=True, kw_only=True)
 class ExportRecord:
     """The dataset exported from this run: content digest, options and path."""
 
@@ -109,14 +94,12 @@ class RunFile:
         robot, fps: Name of the robot and nominal frames per second, of external episodes.
         planned: Names of bags or dataset episodes that the last import was given and has not imported yet.
         attempts: Every finished attempt at the requested episodes, ordered by episode and attempt.
-        sessions: Every start of the command or of a program that added episodes.
     """
 
     robot: str = ""
     fps: int = 0
     planned: tuple[str, ...] = ()
     attempts: tuple[Attempt, ...] = ()
-    sessions: tuple[RunSession, ...] = ()
 
     @property
     def successes(self) -> tuple[Attempt, ...]:
@@ -163,8 +146,7 @@ class RunFile:
         """The content as plain data."""
         plain = to_plain(self)
         about = {key: plain[key] for key in ("robot", "fps", "planned")}
-        sessions = [{key: session[key] for key in ("started", "ended")} for session in plain["sessions"]]
-        return {**about, "sessions": sessions, "episodes": _lines(self.attempts, _EXTERNAL_LINE)}
+        return {**about, "episodes": _lines(self.attempts, _EXTERNAL_LINE)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,7 +209,7 @@ class GeneratedRun(RunFile):
     def plain(self) -> dict[str, Any]:
         """The content as plain data."""
         plain = to_plain(self)
-        about = {key: plain[key] for key in ("config", "versions", "num_episodes", "sessions", "export")}
+        about = {key: plain[key] for key in ("config", "versions", "num_episodes", "export")}
         return {**about, "attempts": _lines(self.attempts, _LINE), "beyond": _lines(self.beyond, _LINE)}
 
 
@@ -285,9 +267,8 @@ def load_any_run_file(folder: Path) -> RunFile:
             raise ValueError("not a JSON object")
         if (version := plain.pop("format")) > RUN_FORMAT:
             raise ConfigError(f"run.json has format {str(version)[:40]}, this demorec knows up to {RUN_FORMAT}: {path}")
-        lines, sessions = plain.pop("episodes"), plain.pop("sessions", [])
         del plain["digest"], plain["complete"]
-        plain |= {"attempts": lines, "sessions": sessions}
+        plain["attempts"] = plain.pop("episodes")
         if plain.pop("kind", "") == _EXTERNAL:
             external = from_plain(plain, RunFile)
             if not external.robot or external.fps < 1:
@@ -308,11 +289,6 @@ def recording_name(episode_index: int, attempt: int, *, success: bool | None) ->
     """episode_000003.mcap, or episode_000003.attempt_0.mcap for a failed attempt."""
     middle = "" if success else f".attempt_{attempt}"
     return f"episode_{episode_index:06d}{middle}.mcap"
-
-
-def utc_now() -> str:
-    """Current UTC time in ISO 8601."""
-    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def refuse_strangers(folder: Path, own: Collection[str]) -> None:

@@ -262,7 +262,7 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
     folder = simulate_run(tmp_path / "run", 4, seed=7, fps=FPS)
     path = folder / "episodes" / "episode_000002.mcap"
     run = load_run_file(folder)
-    result = RunResult(folder=folder, run=run, made=(), interrupted=False)
+    result = RunResult(folder=folder, run=run, made=(), seconds=0.0, interrupted=False)
     found, failures = check_run(result, deep_every=2, progress=lambda done, total: None)
     assert "2 episodes generated again" in found
     assert not [failure for failure in failures if "made again" in failure]

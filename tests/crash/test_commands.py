@@ -143,7 +143,7 @@ def comparable(path: Path) -> Any:
         run = json.loads(path.read_text())
         lines = [{key: value for key, value in line.items() if key != "seconds"} for line in run["episodes"]]
         export = {**run["export"], "seconds": 0.0} if run.get("export") else None
-        return {**run, "sessions": [], "episodes": lines, "export": export}
+        return {**run, "episodes": lines, "export": export}
     return content_of(path)
 
 

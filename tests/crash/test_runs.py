@@ -181,14 +181,12 @@ def test_a_killed_worker_costs_one_attempt(tmp_path: Path, reference: RunResult)
     heard = Remembers()
     result = run_fake(tmp_path / "run", maker="die_once", progress=heard)
     assert result.run.digest == reference.run.digest
-    assert result.run.sessions[-1].lost_workers == 1
     assert heard.said == ["Episode 2 is made again: its worker was ended by SIGKILL (out of memory?)."]
 
 
 def test_an_episode_that_kills_every_worker_ends_the_run_with_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(GenerationError, match=r"Episode 2 failed to be made 5 times.*SIGKILL.*are complete and kept"):
         run_fake(tmp_path / "run", maker="die_always")
-    assert load_run_file(tmp_path / "run").sessions[-1].state == "stopped"
     assert num_finished(tmp_path / "run") > 0
 
 
@@ -251,7 +249,6 @@ def test_the_first_interrupt_lets_current_episodes_end(
     process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
     run = load_run_file(out)
-    assert run.sessions[-1].state == "interrupted"
     assert len(run.successes) == num_finished(out) < 8
     assert_gone(workers)
     assert not list((out / "unfinished").glob("*.part")), "running attempts have ended"
@@ -269,7 +266,6 @@ def test_a_signal_to_the_whole_group_is_left_to_the_driver(tmp_path: Path) -> No
     assert process.returncode == 130
     assert "made again" not in told
     run = load_run_file(out)
-    assert run.sessions[-1].lost_workers == 0
     assert len(run.successes) == num_finished(out) < 8
 
 

@@ -18,7 +18,7 @@ from demorec.runs.run_file import GeneratedRun, load_run_file, save_run_file
 
 def result_of(folder: Path) -> RunResult:
     run = GeneratedRun(config=GenerateConfig(), versions={}, num_episodes=1)
-    return RunResult(folder=folder, run=run, made=(), interrupted=False)
+    return RunResult(folder=folder, run=run, made=(), seconds=0.0, interrupted=False)
 
 
 @pytest.mark.parametrize("folder", ["/data/cubes", "/my data/it's; rm -rf $HOME `x`"])
@@ -41,7 +41,7 @@ def test_the_users_modules_are_allowed_in_them() -> None:
 def test_the_checks_that_warned_are_named(tmp_path: Path) -> None:
     folder = simulate_run(tmp_path / "run", 1, seed=6)
     run = load_run_file(folder)
-    complete = RunResult(folder=folder, run=run, made=(), interrupted=False)
+    complete = RunResult(folder=folder, run=run, made=(), seconds=0.0, interrupted=False)
     assert check_run(complete, progress=lambda done, total: None) == ("none failed, 0 warnings", [])
     save_run_file(replace(run, num_episodes=2), folder)
     summary, failures = check_run(complete, progress=lambda done, total: None)

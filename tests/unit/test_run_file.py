@@ -19,7 +19,6 @@ from demorec.runs.run_file import (
     DamagedRunFileError,
     ExportRecord,
     GeneratedRun,
-    RunSession,
     load_run_file,
     recording_name,
     save_run_file,
@@ -48,7 +47,6 @@ def a_run() -> GeneratedRun:
         versions={"numpy": "2"},
         num_episodes=8,
         export=ExportRecord(run_digest="12", repo_id="me/cubes"),
-        sessions=(RunSession(started="2026-01-01T00:00:00+00:00", machine={"host": "somewhere"}),),
     ).with_attempts(attempts)
 
 
@@ -123,7 +121,7 @@ def test_a_newer_format_is_not_damage(tmp_path: Path) -> None:
 def test_the_digest_depends_on_content_and_on_nothing_else() -> None:
     run = a_run()
     same = [
-        replace(run, sessions=(), export=None, versions={}, num_episodes=9),
+        replace(run, export=None, versions={}, num_episodes=9),
         run.with_attempts([replace(a, seconds=0.0, sha256="", num_bytes=0) for a in reversed(run.attempts)]),
     ]
     assert {other.digest for other in same} == {run.digest}
