@@ -46,7 +46,7 @@ class CheckedRun:
     @property
     def attempts(self) -> list[Attempt]:
         """Attempts that have a recording."""
-        return [attempt for attempt in self.run.known if attempt.file]
+        return [attempt for attempt in self.run.attempts if attempt.file]
 
     @property
     def recordings(self) -> list[Path]:

@@ -36,9 +36,8 @@ _PLACED = re.compile(r"(?:^|(?<=; ))(.*?) @ [\w.]*?(\w+)(?=$|; )")
 class Generate:
     """Generate demonstrations: simulate, record (MCAP), export (LeRobot), check.
 
-    Run the same command again to continue where it stopped. A larger --num-episodes extends the run; a smaller one uses
-    its first episodes and leaves the others in place. The episodes depend only on the episode options and the seed, not
-    on the number of workers, the executor or the order.
+    Run the same command again to continue where it stopped; a larger --num-episodes extends the run. The episodes
+    depend only on the episode options and the seed, not on the number of workers, the executor or the order.
 
     Examples:
       generate-dataset --num-episodes 50 --out recordings/cubes
@@ -193,7 +192,7 @@ class RunProgress(RunObserver, Closing):
             self._bar = ProgressBar(title, total=total, done=done, unit=unit)
         self._bar.set(done)
 
-    def started(self, run: GeneratedRun, workers: int) -> None:
+    def started(self, run: GeneratedRun) -> None:
         """Show that the work begins."""
         self.show("generating", len(run.successes), run.num_episodes)
 

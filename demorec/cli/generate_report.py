@@ -21,15 +21,14 @@ if TYPE_CHECKING:
 
 
 def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int, int], None]) -> tuple[str, list[str]]:
-    """Run every check of the run, its recordings and its dataset that needs no decoded images, for the requested
-    episodes; make the first and one in `deep_every` again and compare.
+    """Run every check of the run, its recordings and its dataset that needs no decoded images; make the first episode
+    and one in `deep_every` again and compare.
 
     Returns the entry for the closing table, and one line for each failed check.
     """
     from demorec.check.report import CheckOptions, check_subjects, find_subjects, prove, useful_workers
 
-    beyond = {result.folder / attempt.file for attempt in result.run.beyond}
-    subjects = [subject for subject in find_subjects([result.folder]) if subject.path not in beyond]
+    subjects = find_subjects([result.folder])
     sample = [a.file for a in result.run.successes[::deep_every]] if deep_every else []
     total = len(subjects) + len(sample)
     workers = useful_workers(subjects, images=False, cores=available_cores())

@@ -239,8 +239,6 @@ def _generated_facts(path: Path, run: GeneratedRun) -> Iterator[tuple[str, str]]
     yield "episodes", f"{len(run.successes)} of {run.num_episodes}{failed}"
     cameras = f"{', '.join(config.cameras)} at {config.width}x{config.height}, {config.video.codec}"
     yield "cameras", cameras if config.cameras else "none"
-    if run.beyond:
-        yield "beyond these", f"{len(run.beyond)} attempts at later episodes, requested earlier"
     if run.export is not None:
         yield "dataset", f"{path / 'dataset'} ({run.export.repo_id})"
 

@@ -43,7 +43,7 @@ def clear_scratch(folder: Path, run: GeneratedRun) -> None:
 
     Anything else in unfinished/, or being written, stays.
     """
-    made = {recording_name(line.episode_index, line.attempt, success=False) for line in run.known}
+    made = {recording_name(line.episode_index, line.attempt, success=False) for line in run.attempts}
     for scratch in (folder / UNFINISHED).glob("*"):
         if not _SCRATCH.fullmatch(scratch.name) or scratch.is_symlink() or not scratch.is_dir():
             continue
@@ -158,8 +158,8 @@ def survey(
     deleted. Returns the attempts with intact recordings, and failed ones without a recording; and file -> reason why it
     was moved. Raises ResourceError, and moves nothing, if this machine cannot read one of them now.
     """
-    known = {a.file: a for a in run.known if a.file}
-    kept = [a for a in run.known if not a.file]
+    known = {a.file: a for a in run.attempts if a.file}
+    kept = [a for a in run.attempts if not a.file]
     set_aside: dict[str, str] = {}
     files = recordings_of(folder)
     for number, path in enumerate(files):

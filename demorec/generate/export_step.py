@@ -31,7 +31,7 @@ def export_run(
 ) -> tuple[ExportRecord, ExportReport | None]:
     """Export the successful episodes of a run to its dataset/, unless it exists already.
 
-    Episodes beyond the requested number are excluded. A dataset that this run made from other content is replaced; one
+    A dataset that this run made from other content is replaced; one
     that it did not make is left alone. One that it made but that is damaged, was changed, or contains other files, is
     moved to unfinished/ and made again. So is an edited card.
 
@@ -59,11 +59,10 @@ def export_run(
         # Saved first: after a crash in between, the dataset is known to be ours.
         save_run_file(replace(run, export=record), folder)
         start = time.process_time()
-        wanted = f":{run.num_episodes}" if run.beyond else ""
         report = export_lerobot(
             [folder],
             target,
-            ExportOptions(repo_id=repo_id, episodes=wanted, overwrite=target.exists()),
+            ExportOptions(repo_id=repo_id, overwrite=target.exists()),
             progress=progress,
         )
         record = replace(record, dataset_digest=report.digest, seconds=round(time.process_time() - start, 3))

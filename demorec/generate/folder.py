@@ -44,7 +44,7 @@ class RunFolder:
     def __init__(self, path: Path, run: GeneratedRun) -> None:
         self.path = path
         self.run = run
-        self._attempts = {(a.episode_index, a.attempt): a for a in run.known}
+        self._attempts = {(a.episode_index, a.attempt): a for a in run.attempts}
         self._made: list[Attempt] = []
         self._started = time.monotonic()
         self._saved_at = -1e9
@@ -53,7 +53,7 @@ class RunFolder:
     @property
     def kept(self) -> str:
         """Progress of the run in one sentence, for messages."""
-        done = sum(bool(a.success) for a in self._attempts.values() if a.episode_index < self.run.num_episodes)
+        done = sum(bool(a.success) for a in self._attempts.values())
         return f"{done} of {self.run.num_episodes} episodes are complete and kept: {self.path}"
 
     def add(self, attempt: Attempt) -> None:
@@ -149,21 +149,17 @@ def _begin_or_continue(path: Path, asked: GeneratedRun, *, progress: RunObserver
         kept = free_name(path / f"{RUN_NAME}.damaged")
         (path / RUN_NAME).rename(kept)
         progress.says(f"{damage}. It is kept as {kept.name}; the recordings are read instead.")
-    run = replace(run, num_episodes=asked.num_episodes)
     with _told_as_unusable(path):
         for name in (EPISODES, FAILED, UNFINISHED):
             (path / name).mkdir(exist_ok=True)
         attempts, set_aside = survey(path, run, inspect=inspect, progress=progress.verifying)
     for file, reason in set_aside.items():
         progress.says(f"{file} was moved to {UNFINISHED}/: {reason}.")
-    run = run.with_attempts(attempts)
-    if run.beyond:
-        more = len({line.episode_index for line in run.beyond})
-        progress.says(
-            f"Beyond the requested episodes ({run.num_episodes}), the folder contains recordings of later ones "
-            f"({more}): they stay, but are not in the run's digest and dataset."
-        )
-    folder = RunFolder(path, run)
+    begun = 1 + max((line.episode_index for line in attempts), default=-1)
+    if begun > asked.num_episodes:
+        progress.says(f"{begun} episodes have been begun before, so the run has {begun} (export --episodes selects).")
+    run = replace(run, num_episodes=max(begun, asked.num_episodes))
+    folder = RunFolder(path, run.with_attempts(attempts))
     folder.save()
     return folder
 
@@ -188,7 +184,7 @@ def _known_run(path: Path, asked: GeneratedRun, *, inspect: Inspector) -> tuple[
         run = _run_of_recordings(recordings, asked, inspect)
     different = plain_differences(to_plain(run.config), to_plain(asked.config))
     different += version_differences(run.versions, asked.versions)
-    if different and not recordings and not any(line.file for line in run.known):
+    if different and not recordings and not any(line.file for line in run.attempts):
         return asked, damage
     if different:
         delete = "" if obstacle(path, RUN) else ", or let it delete this one with --overwrite"

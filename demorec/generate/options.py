@@ -23,7 +23,7 @@ class RunOptions:
     out: OptionalTarget = None
     """Folder of the run (auto: recordings/TASK). Run the same command again to continue where it stopped."""
     num_episodes: int = 50
-    """Number of successful episodes to make; a larger one extends the run, a smaller one excludes the rest."""
+    """Number of successful episodes to make; a larger one extends the run."""
     workers: int | None = None
     """Number of simulating processes (auto: one per core; with Ray, as many as the cluster has room for)."""
     executor: Literal["local", "ray"] = "local"
@@ -66,7 +66,7 @@ class RunObserver:
     def verifying(self, done: int, total: int) -> None:
         """Handle the verification of recordings from an earlier session."""
 
-    def started(self, run: GeneratedRun, workers: int) -> None:
+    def started(self, run: GeneratedRun) -> None:
         """Handle the start of the work; `run` contains everything already made."""
 
     def ended(self, attempt: Attempt) -> None:

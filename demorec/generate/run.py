@@ -88,7 +88,7 @@ def generate(
         if config.cameras and options.executor != "ray":
             RENDERERS.load(config.renderer)().close()  # compiles the renderer before several processes would
         executor = stack.enter_context(make_executor(options, folder.path, folder.run, maker))
-        progress.started(folder.run, executor.workers)
+        progress.started(folder.run)
         try:
             interrupted = _Driver(folder, schedule, executor, progress).work()
         except BaseException:

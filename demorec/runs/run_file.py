@@ -112,11 +112,6 @@ class RunFile:
         return tuple(a for a in self.attempts if not a.success)
 
     @property
-    def known(self) -> tuple[Attempt, ...]:
-        """Every finished attempt, including those beyond the requested episodes."""
-        return self.attempts
-
-    @property
     def num_missing(self) -> int:
         """Number of requested episodes neither finished nor given up."""
         return len(self.planned)
@@ -157,15 +152,12 @@ class GeneratedRun(RunFile):
         config: Options that decide the data.
         versions: package -> version, of the packages that decide the bits.
         num_episodes: Number of successes last requested: episodes 0 to num_episodes - 1.
-        beyond: Attempts at later episodes, from an earlier request for more. They stay, but are not part of the run's
-        digest or dataset.
         export: The dataset exported from it, if any.
     """
 
     config: GenerateConfig
     versions: Mapping[str, str]
     num_episodes: int
-    beyond: tuple[Attempt, ...] = ()
     export: ExportRecord | None = None
 
     @property
@@ -195,22 +187,15 @@ class GeneratedRun(RunFile):
         lines = [f"{a.episode_index} {a.attempt} {int(bool(a.success))} {a.digest}" for a in self.attempts]
         return _digest_of([self.config_digest, *lines])
 
-    @property
-    def known(self) -> tuple[Attempt, ...]:
-        """Every finished attempt, including those beyond the requested episodes."""
-        return self.attempts + self.beyond
-
     def with_attempts(self, attempts: Iterable[Attempt]) -> GeneratedRun:
-        """Return the run with these attempts, in order; those beyond the requested episodes are `beyond`."""
-        ordered = sorted(attempts, key=lambda a: (a.episode_index, a.attempt))
-        within = tuple(a for a in ordered if a.episode_index < self.num_episodes)
-        return replace(self, attempts=within, beyond=tuple(ordered[len(within) :]))
+        """Return the run with these attempts, in order."""
+        return replace(self, attempts=tuple(sorted(attempts, key=lambda a: (a.episode_index, a.attempt))))
 
     def plain(self) -> dict[str, Any]:
         """The content as plain data."""
         plain = to_plain(self)
         about = {key: plain[key] for key in ("config", "versions", "num_episodes", "export")}
-        return {**about, "attempts": _lines(self.attempts, _LINE), "beyond": _lines(self.beyond, _LINE)}
+        return {**about, "attempts": _lines(self.attempts, _LINE)}
 
 
 def _digest_of(lines: Iterable[str]) -> str:
@@ -225,7 +210,7 @@ def save_run_file(run: RunFile, folder: Path) -> None:
     """Replace run.json atomically: a reader sees the old or the new file, also after a crash."""
     plain, head = run.plain(), dict[str, Any](format=RUN_FORMAT)
     if isinstance(run, GeneratedRun):
-        lines = plain.pop("attempts") + plain.pop("beyond")
+        lines = plain.pop("attempts")
         head["config_digest"] = run.config_digest
     else:
         lines = plain.pop("episodes")

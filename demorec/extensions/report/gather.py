@@ -206,19 +206,13 @@ def _recordings_report(
     run, missing = _run_file(found)
     stride, budget = -(-len(files) // MAX_SHOWN), strip_budget(len(files))
     components: Components = {}
-    beyond = run.beyond if isinstance(run, GeneratedRun) else ()
-    unrequested = {found.path / attempt.file for attempt in beyond}
-    if unrequested:
-        missing += (f"{len(unrequested)} recordings of episodes beyond the number last requested are left out.",)
-    wanted = [number for number, file in enumerate(files) if file not in unrequested]
     episodes: list[ReportedEpisode] = []
-    for number in wanted:
-        file = files[number]
+    for number, file in enumerate(files):
         strip_bytes = 0 if number % stride and file.parent.name != FAILED else budget
         episode = _read(partial(open_recording, file), file, named, camera, strip_bytes, components)
         source = file.name if file == found.path else file.relative_to(found.path).as_posix()
         episodes.append(_judged(replace(episode, source=source), number, diagnosis))
-        advance(len(episodes), len(wanted))
+        advance(len(episodes), len(files))
     if run is not None:
         episodes += [_without_recording(attempt) for attempt in run.attempts if not attempt.file]
     facts = [("attempts" if found.failed else "recordings", str(len(episodes)))]
