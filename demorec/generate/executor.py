@@ -21,7 +21,6 @@ from multiprocessing import connection
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from types import FrameType
 from typing import Protocol, Self
 
 from demorec.core.config import EpisodePlan
@@ -43,8 +42,6 @@ CAPACITY_WAIT_S = 300.0
 POLL_S = 0.2
 """Interval, s, at which the caller of `Executor.carry_out` regains control, for example to handle Ctrl-C."""
 _OF_THE_GROUP = frozenset({signal.SIGINT, signal.SIGTERM})
-_LEAVE = signal.SIGUSR1
-"""Signal from the driver to abandon the attempt."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,9 +102,6 @@ class Executor(Protocol):
 
     def wait(self, timeout_s: float) -> list[Report]:
         """Return the attempts that have ended; waits up to `timeout_s` for the first."""
-
-    def interrupt(self) -> None:
-        """Ask every worker to abandon its attempt and end."""
 
     def close(self) -> None:
         """End every worker, even a busy one; safe to call twice."""
@@ -181,10 +175,6 @@ def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raise
     return Made(plan=plan, attempt=attempt)
 
 
-class _Interrupted(BaseException):
-    """Raised in a worker to abandon its attempt; passes every `except Exception`, so that the part file stays."""
-
-
 @dataclass(eq=False)
 class _Worker:
     process: SpawnProcess
@@ -244,12 +234,6 @@ class LocalExecutor(Executor):
                     reports.append(lost(plan, _death(worker.process.exitcode)))
         return reports
 
-    def interrupt(self) -> None:
-        """See `Executor`."""
-        for worker in self._live:
-            if worker.process.pid is not None and worker.process.is_alive():
-                os.kill(worker.process.pid, _LEAVE)
-
     def close(self) -> None:
         """End every worker: idle ones by message, busy ones by SIGKILL (their part files stay)."""
         for worker in list(self._live):
@@ -287,25 +271,19 @@ class LocalExecutor(Executor):
 
 
 def _worker_main(pipe: Connection[Report, EpisodePlan | None], maker: str, folder: Path) -> None:
-    """Run a worker: plans in, reports out, until None, the signal to abandon, or the driver's death."""
+    """Run a worker: plans in, reports out, until None or the driver's death."""
     # Both may reach the whole process group (Ctrl-C, timeout); the driver decides their meaning.
     for number in _OF_THE_GROUP:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _OF_THE_GROUP)
-    signal.signal(_LEAVE, _raise_interrupted)
     try:
         while (plan := pipe.recv()) is not None:
             pipe.send(attempt_episode(maker, plan, folder))
-    except (EOFError, OSError, _Interrupted):
+    except (EOFError, OSError):
         pass
     # Nothing is left to flush, and native libraries may crash or stall during teardown.
     sys.stderr.flush()
     os._exit(0)
-
-
-def _raise_interrupted(number: int, frame: FrameType | None) -> None:
-    signal.signal(_LEAVE, signal.SIG_IGN)
-    raise _Interrupted
 
 
 def _death(exitcode: int | None) -> str:

@@ -132,11 +132,6 @@ class RayExecutor(Executor):
                 reports.append(lost(plan, f"its Ray worker was lost ({type(error).__name__})"))
         return reports
 
-    def interrupt(self) -> None:
-        """Ask every worker to abandon its attempt."""
-        for reference in self._pending:
-            ray.cancel(reference, force=False)
-
     def close(self) -> None:
         """Cancel the running attempts."""
         if not ray.is_initialized():

@@ -198,9 +198,11 @@ class _Driver:
             self._progress.says(
                 f"Interrupted: the current episodes may end within {GRACE_S:.0f} s (Ctrl-C again ends at once)."
             )
-            self._drain()
-            self._executor.interrupt()
-            self._drain()
+            deadline = time.monotonic() + GRACE_S
+            while self._executor.pending and time.monotonic() < deadline:
+                for report in self._executor.wait(POLL_S):
+                    if isinstance(report, Made):
+                        self._made(report)
             return True
 
     def _reports(self) -> Iterator[list[Report]]:
@@ -208,13 +210,6 @@ class _Driver:
             yield from self._executor.carry_out(self._schedule.take, says=self._progress.says)
         except GenerationError as error:  # the executor does not know the run
             raise GenerationError(f"{error} {self._folder.kept}") from error
-
-    def _drain(self) -> None:
-        deadline = time.monotonic() + GRACE_S
-        while self._executor.pending and time.monotonic() < deadline:
-            for report in self._executor.wait(POLL_S):
-                if isinstance(report, Made):
-                    self._made(report)
 
     def _made(self, report: Made) -> None:
         self._schedule.report(report.attempt)

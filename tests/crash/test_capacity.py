@@ -61,9 +61,6 @@ class Waning(Executor):
             return [lost(plan, "its machine is gone")]
         return [attempt_episode("support.makers:make", plan, self.folder)]
 
-    def interrupt(self) -> None:
-        raise AssertionError("this run is not interrupted")
-
     def close(self) -> None:
         self.plans.clear()
 
