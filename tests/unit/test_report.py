@@ -42,13 +42,11 @@ class Page(HTMLParser):
         tags: (name, attributes) of every element.
         articles: Text of every article.
         words: Text outside of style and script.
-        code: Content of style and script.
     """
 
     tags: list[tuple[str, dict[str, str | None]]] = field(default_factory=list)
     articles: list[str] = field(default_factory=list)
     words: str = ""
-    code: dict[str, str] = field(default_factory=dict)
     open: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -66,7 +64,6 @@ class Page(HTMLParser):
 
     def handle_data(self, data: str) -> None:
         if self.open and self.open[-1] in ("style", "script"):
-            self.code[self.open[-1]] = self.code.get(self.open[-1], "") + data
             return
         self.words += data
         if "article" in self.open and data.strip():
@@ -149,7 +146,7 @@ def test_a_dataset_and_its_run_have_the_same_report(run: Path, dataset: Path) ->
     ours, theirs = gather(run), gather(dataset)
     of_run = {key: np.concatenate(parts).tolist() for key, parts in gather(run / "episodes").distributions.items()}
     assert {key: np.concatenate(parts).tolist() for key, parts in theirs.distributions.items()} == of_run
-    for name in ("name", "success", "phases", "seed", "instruction", "num_frames"):
+    for name in ("name", "success", "instruction", "num_frames"):
         assert [getattr(e, name) for e in theirs.episodes] == [getattr(e, name) for e in ours.episodes[:3]]
     assert not theirs.missing
 
@@ -158,7 +155,6 @@ def test_a_third_party_dataset_lists_missing_parts(dataset: Path, tmp_path: Path
     other = shutil.copytree(dataset, tmp_path / "other")
     shutil.rmtree(other / "demorec")
     found = report_on(other)
-    assert "no folder demorec/, which exports of demorec have" in found.words
     assert "3 of 3 attempts succeeded" in found.words  # from the column next.success
     assert len(list(found.all("img"))) == 3
     file = other / "meta" / "info.json"
@@ -207,7 +203,6 @@ def test_foreign_text_has_no_effect(run: Path, tmp_path: Path) -> None:
     info["simulation"]["config"] = {HOSTILE: HOSTILE}
     info["versions"] = {"demorec": HOSTILE}
     ended.update(success=False, failure_phase=HOSTILE, failure_reason=HOSTILE)
-    ended["checks"][0].update(name=HOSTILE, unit=HOSTILE, passed=False)
     change = {"demorec.episode": {"info": json.dumps(info)}, "demorec.outcome": {"outcome": json.dumps(ended)}}
     folder = tmp_path / "<script>alert(1)<"
     folder.mkdir()
@@ -215,13 +210,12 @@ def test_foreign_text_has_no_effect(run: Path, tmp_path: Path) -> None:
     text = page(gather(folder))
     found = parsed(text)
     assert "\u202e" not in text
-    assert [name for name, _ in found.tags].count("script") == 1
+    assert "script" not in [name for name, _ in found.tags]
     assert not [key for _, attributes in found.tags for key in attributes if key.startswith("on")]
     assert "|safe" not in "".join(file.read_text() for file in TEMPLATES.glob("*.html")).replace(" ", "")
-    assert found.code["script"] == (TEMPLATES / "page.js").read_text()
     shown = HOSTILE.replace("\u202e", "\\u202e")
-    assert found.articles[0].count(shown) >= 4
-    assert found.words.count(shown) >= 9
+    assert found.articles[0].count(shown) >= 3
+    assert found.words.count(shown) >= 8
 
 
 @pytest.mark.parametrize("count", [1000, 9000])

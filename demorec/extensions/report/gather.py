@@ -16,10 +16,9 @@ from demorec.check.base import Finding
 from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
 from demorec.core.replacing import shown
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.episode.element_names import is_numbered
-from demorec.episode.episode import Outcome, SuccessCheck, consecutive_runs
+from demorec.episode.episode import Outcome
 from demorec.episode.protocol import Episode
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recording
 from demorec.episode.simulated import simulation_facts
@@ -60,8 +59,6 @@ class ReportedEpisode:
         instruction: Text of the instruction.
         outcome: None if unknown.
         num_frames, fps: Length and frame rate.
-        seed: Root seed of the run.
-        phases: (name, first frame, frame after the last) of each phase, in order.
         flags: Findings of checks, broken ones first.
         score: Score by the doctor; 1 for a good or unjudged episode.
         filmstrip: None without images, and for some successes in a long report.
@@ -75,8 +72,6 @@ class ReportedEpisode:
     outcome: Outcome | None = None
     num_frames: int = 0
     fps: int = 1
-    seed: int | None = None
-    phases: tuple[tuple[str, int, int], ...] = ()
     flags: tuple[Finding, ...] = ()
     score: float = 1.0
     filmstrip: Filmstrip | None = None
@@ -164,10 +159,6 @@ _KINDS: Mapping[PathKind, str] = {
     "evaluation": "evaluation of a policy",
     "recordings": "folder of recordings",
 }
-_DETAILS = (
-    "source", "root_seed", "success", "failure_phase", "failure_reason", "num_retries", "checks", "phases",
-)  # fmt: skip
-"""Columns of the sidecar."""
 _Progress = Callable[[int, int], None]
 
 
@@ -239,25 +230,17 @@ def _dataset_report(
     stride, budget = max(1, -(-len(folder.places) // MAX_SHOWN)), strip_budget(len(folder.places))
     flagged = set() if diagnosis is None else {finding.episode for finding in diagnosis.findings}
     without_videos = folder.leave_out_missing_cameras()
-    rows = {row["episode_index"]: row for row in folder.sidecar(_DETAILS)}
     components: Components = {}
     episodes: list[ReportedEpisode] = []
     for number, place in enumerate(folder.places):
         strip_bytes = budget if place.episode_index in flagged or number % stride == 0 else 0
         episode = _read(partial(_stored, folder, number), root, folder.roles, camera, strip_bytes, components)
         episode = replace(episode, name=f"episode {place.episode_index}")
-        if place.episode_index in rows:
-            episode = _with_details(episode, rows[place.episode_index], root)
         episodes.append(_judged(episode, place.episode_index, diagnosis))
         advance(len(episodes), len(folder.places))
     files = (file for file in root.rglob("*") if file.is_file())
     facts = [("episodes", str(len(episodes))), *_common_facts(episodes, files)]
     missing = [*folder.notes, *(f"No episode has a video of {key}." for key in without_videos), *folder.roles.notes()]
-    if not rows:
-        missing.append(
-            f"The dataset has no folder {SIDECAR_DIR}/, which exports of demorec have: random seeds, phases "
-            "and the conditions of success are not known."
-        )
     return Report(
         title=root.resolve().name,
         kind="LeRobot dataset",
@@ -310,8 +293,6 @@ def _read(
                 outcome=episode.outcome,
                 num_frames=episode.num_frames,
                 fps=info.fps,
-                seed=simulation_facts(info).get("root_seed"),
-                phases=tuple(consecutive_runs(episode.phases)),
                 filmstrip=strip,
                 facts=tuple(_facts_of(episode)),
             )
@@ -319,21 +300,6 @@ def _read(
         if (lack := resource_error(error)) is not None:
             raise lack from error
         return ReportedEpisode(name=path.stem, problem=without_path(error, path).replace(f"{path}/", ""))
-
-
-def _with_details(episode: ReportedEpisode, row: Mapping[str, Any], root: Path) -> ReportedEpisode:
-    """Add seed, phases and outcome of the sidecar's row. Raises ExportError if it cannot be used."""
-    try:
-        names = ("success", "failure_phase", "failure_reason", "num_retries")
-        known = {name: row[name] for name in names if row[name] is not None}
-        checks = tuple(SuccessCheck(**check) for check in row["checks"] or ())
-        phases = tuple((phase["name"], phase["from"], phase["to"]) for phase in row["phases"] or ())
-    except (KeyError, TypeError) as error:
-        raise ExportError(
-            f"The sidecar's row of {episode.name} cannot be used ({describe_error(error)}): {root}"
-        ) from error
-    outcome = Outcome(num_frames=episode.num_frames, checks=checks, **known)
-    return replace(episode, seed=row["root_seed"], phases=phases, outcome=outcome, source=str(row["source"] or ""))
 
 
 def _facts_of(episode: Episode) -> Iterator[tuple[str, str]]:
@@ -396,5 +362,4 @@ def _without_recording(attempt: Attempt) -> ReportedEpisode:
         name=f"episode {attempt.episode_index}, attempt {attempt.attempt}",
         problem="Nothing was recorded, since no scene could be laid out.",
         outcome=Outcome(success=False, num_frames=0, failure_phase=attempt.phase, failure_reason=attempt.reason),
-        seed=attempt.seed,
     )

@@ -1,4 +1,4 @@
-"""A report as one HTML file without network access, fonts or libraries, readable without scripts.
+"""A report as one HTML file without network access, fonts, libraries or scripts.
 
 The templates in templates/ hold all markup. Their output is escaped, and invisible characters are spelled out, so no
 text from a file can act on the page.
@@ -27,7 +27,6 @@ from demorec.core.text import printable
 from demorec.extensions.doctor.diagnosis import Diagnosis
 from demorec.extensions.report.filmstrip import MAX_SHOWN
 from demorec.extensions.report.gather import MAX_SAMPLES, Report, ReportedEpisode, State, success_rate
-from demorec.view.style import phase_colors
 
 CHART_WIDTH = 220
 """Width of a chart without its labels, in units of its SVG."""
@@ -42,7 +41,7 @@ _STATES: dict[State, str] = {
     "succeeded": "succeeded",
 }
 """State of an episode -> its label, in the order of the list of episodes."""
-_GOOD = ("success at the first try", "success after a retry")
+_SUCCESS = "success"
 
 
 def write_page(report: Report, path: Path) -> int:
@@ -57,24 +56,19 @@ def page(report: Report) -> str:
 
 
 def _stream(report: Report) -> TemplateStream:
-    shown = _shown(report.episodes)
-    phases = (name for _, episode in shown if episode.filmstrip for name, _, _ in episode.phases)
-    colors = {name: "#" + bytes(rgb[:3]).hex() for name, rgb in phase_colors(phases).items()}
-    style, script = _own_text("page.css"), _own_text("page.js")
+    style = Markup((files("demorec.extensions.report") / "templates" / "page.css").read_text(encoding="utf-8"))
     template = _environment().get_template("page.html")
     return template.stream(
         report=report,
         mark=Markup(REPORT_MARK),
         style=style,
-        script=script,
-        policy=f"default-src 'none'; img-src data:; style-src {_digest(style)}; script-src {_digest(script)}",
+        policy=f"default-src 'none'; img-src data:; style-src {_digest(style)}",
         outcomes=_outcomes(report.episodes),
         findings=[] if report.diagnosis is None else list(_findings(report.diagnosis)),
         rate=success_rate(report.episodes),
         distributions=list(_distributions(report)),
-        shown=shown,
+        shown=_shown(report.episodes),
         counts=Counter(episode.state for episode in report.episodes),
-        colors=colors,
     )
 
 
@@ -88,22 +82,15 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(
-        max_samples=MAX_SAMPLES, states=_STATES, phase_bar=_phase_bar, width=CHART_WIDTH, height=CHART_HEIGHT
-    )
+    environment.globals.update(max_samples=MAX_SAMPLES, states=_STATES, width=CHART_WIDTH, height=CHART_HEIGHT)
     environment.filters.update(
         fmt=format, base64=lambda data: base64.b64encode(data).decode(), about=_about, place=_place
     )
     return environment
 
 
-@cache
-def _own_text(name: str) -> Markup:
-    return Markup((files("demorec.extensions.report") / "templates" / name).read_text(encoding="utf-8"))
-
-
 def _digest(content: str) -> str:
-    """Hash by which the Content-Security-Policy allows the page's own style and script."""
+    """Hash by which the Content-Security-Policy allows the page's own style."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
 
 
@@ -131,9 +118,9 @@ def _outcomes(episodes: Sequence[ReportedEpisode]) -> list[tuple[str, list[int]]
         elif not episode.success:
             outcome = f"failed: {episode.failure}"
         else:
-            outcome = _GOOD[episode.outcome.num_retries > 0]
+            outcome = _SUCCESS
         groups.setdefault(outcome, []).append(number)
-    return sorted(groups.items(), key=lambda item: (item[0] in _GOOD, -len(item[1]), item[0]))
+    return sorted(groups.items(), key=lambda item: (item[0] == _SUCCESS, -len(item[1]), item[0]))
 
 
 def _findings(diagnosis: Diagnosis) -> Iterator[tuple[Finding, str]]:
@@ -152,12 +139,11 @@ def _place(finding: Finding) -> str:
 
 
 def _about(episode: ReportedEpisode) -> str:
-    """Length, retries, seed and source, if known."""
+    """Length, retries and source, if known."""
     num_retries = episode.outcome.num_retries if episode.outcome else 0
     parts = [
         f"{episode.num_frames / episode.fps:.1f} s, {episode.num_frames} frames" if episode.num_frames else "",
         f"{num_retries} {'retry' if num_retries == 1 else 'retries'}" if num_retries else "",
-        "" if episode.seed is None else f"seed {episode.seed}",
         episode.source,
     ]
     return ", ".join(filter(None, parts))
@@ -210,12 +196,3 @@ def _distributions(report: Report) -> Iterator[Chart]:
     if len(seconds) > 1:
         lengths = distribution("length of episodes (s)", {"state": np.array(seconds, np.float32)})
         yield lengths._replace(note=f"mean: {np.mean(seconds):.3g}")
-
-
-def _phase_bar(episode: ReportedEpisode, colors: Mapping[str, str]) -> Iterator[tuple[str, str, str, str]]:
-    """Yield (title, left, width, color) of each phase, in images of the filmstrip, whose middles are their moments."""
-    assert episode.filmstrip is not None
-    last = max(episode.num_frames - 1, 1)
-    for name, first, end in episode.phases:
-        left, right = (0.5 + (episode.filmstrip.moments - 1) * min(frame, last) / last for frame in (first, end))
-        yield f"{name}, frames {first} to {end - 1}", f"{left:.6g}", f"{right - left:.6g}", colors[name]
