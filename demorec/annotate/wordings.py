@@ -22,12 +22,10 @@ from demorec.annotate.referring import (
     resolve,
     situation,
 )
-from demorec.episode.scene import Goal, Scene
+from demorec.episode.scene import Scene
 
 WORDINGS = 24
 """Number of wordings per episode, the same for every task."""
-_ON = 0.01
-"""Maximum gap below an object that still counts as resting on another, in metres."""
 
 _PUT = (
     "put {o} {p}",
@@ -42,12 +40,6 @@ _PUT = (
     "get {o} and set it {p}",
 )
 _INTO = ("move {o} {i}", "bring {o} {i}", "carry {o} {i}", "transfer {o} {i}")
-_OFF = (
-    "take {o} off {b} and put it {p}",
-    "lift {o} off {b} and place it {p}",
-    "remove {o} from {b} and put it {p}",
-    "unstack {o} from {b} and set it {p}",
-)
 _DROP = (
     "drop {o} {i}",
     "let {o} fall {i}",
@@ -62,11 +54,10 @@ _THEN = ("{a}, then {b}", "first {a}, then {b}", "{a}, and then {b}", "{a}; afte
 
 
 class _Clause(NamedTuple):
-    """Names of a goal's object, of its place and of the object below it, "" for none."""
+    """Names of a goal's object and of its place, "" for none."""
 
     object: str
     place: str
-    base: str
 
 
 def task_wordings(scene: Scene, instruction: str, rng: np.random.Generator, *, is_dropped: bool) -> list[str]:
@@ -75,7 +66,7 @@ def task_wordings(scene: Scene, instruction: str, rng: np.random.Generator, *, i
     `rng` chooses among all possible wordings; with `is_dropped`, objects are dropped rather than set down.
     """
     start = situation(scene)
-    clauses = [_Clause(goal.object, place_of(scene, goal), _base_of(goal, start)) for goal in scene.goals]
+    clauses = [_Clause(goal.object, place_of(scene, goal)) for goal in scene.goals]
     options = [list(_sentences(scene, clause, start, is_dropped)) for clause in clauses]
     sentences = list(dict.fromkeys([*_by_class(scene, clauses, start), *_one_by_one(options, rng)]))
     chosen = [sentences[index] for index in rng.permutation(len(sentences))[: WORDINGS - 1]]
@@ -95,20 +86,7 @@ def _is_proved(text: str, clauses: Sequence[_Clause], start: Surroundings) -> bo
     """Whether each phrase of a wording is unambiguous and all together refer to the goals' objects."""
     found = list(references(text, start))
     wanted = {name for clause in clauses for name in (clause.object, clause.place) if name}
-    allowed = wanted | {clause.base for clause in clauses}
-    return all(found) and wanted <= set().union(*found) <= allowed
-
-
-def _base_of(goal: Goal, start: Surroundings) -> str:
-    """Name of the movable object below a goal's object, or ""."""
-    upper = start[goal.object]
-    for name, thing in start.items():
-        extents = thing.body.shape.extents
-        x, y, z = np.abs(upper.position - thing.position).tolist()
-        gap = abs(z - (upper.body.shape.extents[2] + extents[2]) / 2)
-        if thing is not upper and thing.body.movable and gap < _ON and max(x, y) < max(extents) / 2:
-            return name
-    return ""
+    return all(found) and wanted == set().union(*found)
 
 
 def _one_by_one(options: Sequence[Sequence[str]], rng: np.random.Generator) -> Iterator[str]:
@@ -126,14 +104,13 @@ def _one_by_one(options: Sequence[Sequence[str]], rng: np.random.Generator) -> I
 def _sentences(scene: Scene, clause: _Clause, start: Surroundings, is_dropped: bool) -> Iterator[str]:
     objects = list(phrases_for(clause.object, start))
     places = list(phrases_for(clause.place, start)) if clause.place else []
-    base = next(phrases_for(clause.base, start), "") if clause.base else ""
     into, inside = prepositions(scene, clause.place)
     is_on_cube = bool(clause.place) and start[clause.place].body.movable
-    templates = _DROP if is_dropped else (*_PUT, *_INTO, *(_OFF if base else ()))
+    templates = _DROP if is_dropped else (*_PUT, *_INTO)
     for template, object_, place in product(templates, objects, places):
-        yield template.format(o=object_, i=f"{into} {place}", p=f"{inside} {place}", b=base)
+        yield template.format(o=object_, i=f"{into} {place}", p=f"{inside} {place}")
         if is_on_cube and "{p}" in template:
-            yield template.format(o=object_, p=f"on top of {place}", b=base)
+            yield template.format(o=object_, p=f"on top of {place}")
     if is_on_cube:
         yield from (f"stack {object_} on {place}" for object_, place in product(objects, places))
 
