@@ -1,6 +1,6 @@
 """Differences between two LeRobot datasets: features, episodes, rows and encoded images.
 
-Episodes are matched by content, whatever their order, files, format version and task numbers.
+Equal episodes are matched by content, whatever their order, files, format version and task numbers; others by number.
 """
 
 from __future__ import annotations
@@ -21,8 +21,6 @@ from demorec.datasets.options import ProgressCallback
 
 TASK = "task"
 """Name of the instructions, instead of `task_index`."""
-_OFTEN_EQUAL = (TASK, "timestamp", "next.")
-"""Beginnings of the names of columns that different episodes share."""
 _MAX_TEXT = 120
 
 Digests = Mapping[str, bytes]
@@ -36,21 +34,20 @@ class DatasetDiff:
     Attributes:
         num_episodes: Number of episodes in A and in B.
         num_same: Number of pairs with equal rows and packets.
-        differences: Description of a difference -> its pairs of episodes; none if it concerns the whole dataset.
+        differences: Description of a difference -> its episodes; none if it concerns the whole dataset.
         notes: Sentences on how the datasets were read.
     """
 
     num_episodes: tuple[int, int]
     num_same: int
-    differences: Mapping[str, Sequence[tuple[int, int]]]
+    differences: Mapping[str, Sequence[int]]
     notes: tuple[str, ...] = ()
 
     def lines(self) -> Iterator[str]:
         """Yield a line for each difference."""
-        for text, pairs in self.differences.items():
-            numbers = [f"{a}{'' if a == b else f' (in B {b})'}" for a, b in pairs]
-            where = f"episode{'s' * (len(numbers) > 1)} {listed(numbers, 8, ', ')}: " if numbers else ""
-            yield f"{where}{text}"
+        for text, numbers in self.differences.items():
+            noun = f"episode{'s' * (len(numbers) > 1)} {listed([str(number) for number in numbers], 8, ', ')}: "
+            yield f"{noun}{text}" if numbers else text
 
 
 def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetDiff:
@@ -74,17 +71,17 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
             if progress is not None:
                 progress(len(digests[0]) + len(digests[1]), total)
     pairs = _matched(*digests)
-    differences: dict[str, list[tuple[int, int]]] = {text: [] for text in _info_differences(*folders)}
+    differences: dict[str, list[int]] = {text: [] for text in _info_differences(*folders)}
     for name, numbers, others in (("A", pairs.keys(), digests[0]), ("B", pairs.values(), digests[1])):
         if alone := [str(number) for number in range(len(others)) if number not in numbers]:
             differences[f"episodes only in {name}: {listed(alone, 8, ', ')}"] = []
     num_same = 0
-    for pair in pairs.items():
-        one, other = digests[0][pair[0]], digests[1][pair[1]]
+    for number, match in pairs.items():
+        one, other = digests[0][number], digests[1][match]
         num_same += one == other
-        if one != other:
-            for text in _episode_differences(readers, pair, [name for name in one if one[name] != other[name]]):
-                differences.setdefault(text, []).append(pair)
+        if one != other:  # then they have the same number
+            for text in _episode_differences(readers, number, [name for name in one if one[name] != other[name]]):
+                differences.setdefault(text, []).append(number)
     return DatasetDiff(
         num_episodes=(len(digests[0]), len(digests[1])),
         num_same=num_same,
@@ -135,7 +132,7 @@ def _digest(values: NDArray[Any]) -> bytes:
 
 
 def _matched(a: Sequence[Digests], b: Sequence[Digests]) -> dict[int, int]:
-    """Match equal episodes, then those with the most in common, preferably at the same position."""
+    """Match equal episodes, then the others by number."""
     found: dict[int, int] = {}
     equal: dict[tuple[bytes, ...], list[int]] = {}
     for number, digests in enumerate(b):
@@ -143,18 +140,9 @@ def _matched(a: Sequence[Digests], b: Sequence[Digests]) -> dict[int, int]:
     for number, digests in enumerate(a):
         if others := equal.get(tuple(digests.values())):
             found[number] = others.pop(others.index(number) if number in others else 0)
-    rest = set(range(len(b))) - set(found.values())
-    for number in sorted(set(range(len(a))) - set(found)):
-        common = {other: _num_common(a[number], b[other]) for other in rest}
-        best = max(rest, key=lambda other: (common[other], other == number), default=None)
-        if best is not None and (common[best] or best == number):
-            found[number] = best
-            rest.remove(best)
+    taken = set(found.values())
+    found |= {number: number for number in range(min(len(a), len(b))) if number not in found and number not in taken}
     return dict(sorted(found.items()))
-
-
-def _num_common(a: Digests, b: Digests) -> int:
-    return sum(a[name] == b[name] for name in a if not name.startswith(_OFTEN_EQUAL))
 
 
 def _info_differences(a: LeRobotFolder, b: LeRobotFolder) -> Iterator[str]:
@@ -172,11 +160,9 @@ def _info_differences(a: LeRobotFolder, b: LeRobotFolder) -> Iterator[str]:
                 yield f"the feature {name} has the {what} {shown[0]}, in B {shown[1]}"
 
 
-def _episode_differences(
-    readers: Sequence[_ContentReader], pair: tuple[int, int], names: Sequence[str]
-) -> Iterator[str]:
+def _episode_differences(readers: Sequence[_ContentReader], number: int, names: Sequence[str]) -> Iterator[str]:
     """Describe the differences of an episode in these columns and cameras."""
-    a, b = (reader.columns(number) for reader, number in zip(readers, pair, strict=True))
+    a, b = (reader.columns(number) for reader in readers)
     lengths = len(a[TASK]), len(b[TASK])
     if lengths[0] != lengths[1]:
         yield f"{lengths[0]} frames, {lengths[1]} in B"
