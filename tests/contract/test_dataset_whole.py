@@ -36,7 +36,7 @@ READERS = {
     "rename": "dataset rename PATH action=command --out NEW",
     "drop-features": "dataset drop-features PATH next.reward --out NEW",
     "set-task": "dataset set-task PATH --task push --out NEW",
-    "reorder": "dataset reorder PATH --by num_frames --out NEW",
+    "reorder": "dataset reorder PATH --order 3,2,1,0 --out NEW",
     "shuffle": "dataset shuffle PATH --out NEW",
     "diff": "dataset diff PATH PATH",
 }

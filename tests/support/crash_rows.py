@@ -139,7 +139,7 @@ ROWS = {
     "rename": _edit("rename SOURCES/dataset action=command"),
     "drop-features": _edit("drop-features SOURCES/dataset next.reward"),
     "set-task": _edit("set-task SOURCES/dataset --task push"),
-    "reorder": _edit("reorder SOURCES/dataset --by num_frames"),
+    "reorder": _edit("reorder SOURCES/dataset --order 2,0,1"),
     "shuffle": _edit("shuffle SOURCES/dataset --seed 1"),
     "report": Row(
         call="report SOURCES/dataset --no-checks --out new.html",

@@ -101,41 +101,24 @@ class SetTask(Chosen):
 
 @dataclass(frozen=True, kw_only=True)
 class Reorder(EditOne):
-    """Put the episodes into another order: sorted by a column, or as listed.
+    """Put the episodes into another order.
 
     Examples:
-      demorec dataset reorder cups --by num_frames --out sorted
       demorec dataset reorder cups --order 2,0,1 --out new
     """
 
-    by: str = ""
-    """Column to sort by."""
-    descending: bool = False
-    """With --by: largest first."""
     order: tuple[str, ...] = ()
     """Numbers of all episodes in their new order, 2,0,1."""
 
     def edited(self, plan: Plan) -> Plan:
-        """All episodes in the new order; those without a value in the column come last."""
+        """All episodes in the new order."""
         from demorec.datasets.options import select_episodes
-        from demorec.extensions.editing.condition import check_column, columns_of
 
-        if bool(self.by) == bool(self.order):
-            raise ConfigError("Give either --by or --order.")
         count = len(plan.cuts)
-        if self.order:
-            order = select_episodes(range(count), " ".join(self.order), "order")
-            if sorted(order) != list(range(count)):
-                raise ConfigError(f"--order names each of the {count} episodes once, from 0 on.")
-            return plan.with_episodes(order)
-        rows = columns_of(plan.sources[0], {self.by})
-        check_column(self.by, rows)
-        known = [number for number, row in enumerate(rows) if row.get(self.by) is not None]
-        try:
-            known.sort(key=lambda number: rows[number][self.by], reverse=self.descending)
-        except TypeError as error:
-            raise ConfigError(f"The values of {self.by} cannot be sorted.") from error
-        return plan.with_episodes([*known, *(number for number in range(count) if number not in set(known))])
+        order = select_episodes(range(count), " ".join(self.order), "order")
+        if not self.order or sorted(order) != list(range(count)):
+            raise ConfigError(f"--order names each of the {count} episodes once, from 0 on.")
+        return plan.with_episodes(order)
 
 
 @dataclass(frozen=True, kw_only=True)
