@@ -139,14 +139,6 @@ def test_images_are_those_of_the_rollout() -> None:
     env.close()
 
 
-def test_a_recordings_scene_can_be_set_up() -> None:
-    scene = episode(7, seed=99).info.simulated.scene
-    env = make(split="all")
-    env.reset(seed=0, options={"scene": scene, "something of LeRobot's": True})
-    assert env.info.simulated.scene == scene
-    env.close()
-
-
 def test_a_varying_number_of_objects_is_refused_where_a_vector_must_hold_them() -> None:
     env = make("sort_by_color", privileged=True)
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import ProgressBar, say, say_json
 from demorec.cli.shared.paths import refuse_inside
-from demorec.core.config import GenerateConfig, VideoConfig
+from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.options import Rare
 from demorec.core.replacing import OptionalTarget
@@ -60,8 +60,6 @@ class RolloutFlags:
     """How much the scenes vary, as in generate-dataset."""
     renderer: Rare[str | None] = None
     """Renderer for a policy that uses images (auto: that of generate-dataset)."""
-    video: VideoConfig = field(default_factory=VideoConfig)
-    """Encoding of the recorded images."""
     workers: int | None = None
     """Processes (auto: one per core)."""
     allow: Rare[Allow] = ()
@@ -106,7 +104,7 @@ class RolloutFlags:
             )
 
     def _config(self) -> GenerateConfig:
-        names = (*_SCENES, "fps", "cameras", "video", "renderer")
+        names = (*_SCENES, "fps", "cameras", "renderer")
         values: dict[str, Any] = {name: getattr(self, name) for name in names}
         return GenerateConfig(**{name: value for name, value in values.items() if value is not None})
 

@@ -11,7 +11,8 @@ the environment returns the recorded observations, bit-exact. Importing this mod
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
@@ -27,8 +28,7 @@ from demorec.episode import features
 from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, Frame, Observation, Observations, SuccessCheck
 from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
 from demorec.episode.info import EpisodeInfo
-from demorec.episode.scene import Scene
-from demorec.episode.simulated import on_request, with_simulation
+from demorec.episode.simulated import on_request
 from demorec.loop import PreparedEpisode, Session, SimulatorCache, Step, prepare
 from demorec.loop.actions import ACTION_KINDS, ActionDecoder, action_bounds
 from demorec.render.painter import Painter, WarmRenderer
@@ -78,7 +78,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     to the motors, which the datasets store as `command` of the frame before.
 
     `reset(seed=N)` returns the scene of episode N of the split, independent of earlier calls; without a seed, a random
-    one. `reset(options={"scene": scene})` restores the scene of a recording.
+    one.
 
     Args:
         task: A name of `demorec list tasks`, or package.module:Name.
@@ -177,16 +177,14 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode; the class describes `seed` and the option "scene".
+        """Begin an episode; the class describes `seed`, and there are no options.
 
         Raises:
-            SceneError: No layout was found, the scene cannot be built, or its features do not match the observation
-                space.
+            SceneError: No layout was found, or its features do not match the observation space.
         """
         super().reset(seed=seed)
-        scene = (options or {}).get("scene")
         index = int(self.np_random.integers(2**31)) if seed is None else seed
-        self.episode = self._prepare(index, scene)
+        self.episode = self._prepare(index)
         info = self.info
         if self._lengths(info) != self._vector_lengths:
             raise SceneError(
@@ -252,19 +250,13 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             self._viewers.close()
         self._viewer = self._session = self._situation = None
 
-    def _prepare(self, index: int, scene: Scene | None) -> PreparedEpisode:
+    def _prepare(self, index: int) -> PreparedEpisode:
         """Prepare the first attempt at this episode that has a layout, as in generation."""
-        for attempt in range(self.config.max_attempts):
-            try:
-                episode = prepare(EpisodePlan(config=self.config, episode_index=index, attempt=attempt))
-                break
-            except SceneError:
-                if attempt == self.config.max_attempts - 1:
-                    raise
-        if scene is None:
-            return episode
-        scene = replace(scene, cameras=episode.info.simulated.scene.cameras)
-        return replace(episode, info=with_simulation(episode.info, scene=scene))
+        last = self.config.max_attempts - 1
+        for attempt in range(last):
+            with suppress(SceneError):
+                return prepare(EpisodePlan(config=self.config, episode_index=index, attempt=attempt))
+        return prepare(EpisodePlan(config=self.config, episode_index=index, attempt=last))
 
     def _is_privileged(self) -> bool:
         """Default of `privileged`: True without cameras and with equally many objects in each of the first scenes."""
@@ -272,7 +264,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             return False
         lengths = set()
         for index in range(PROBED_SCENES):
-            simulated = self._prepare(index, None).info.simulated
+            simulated = self._prepare(index).info.simulated
             names = features.observation_names(simulated.robot, simulated.scene, privileged=True)
             lengths.add(len(names[features.ENVIRONMENT_STATE]))  # a round object has no yaw: its vector is shorter
         return len(lengths) == 1
