@@ -52,15 +52,15 @@ class RayExecutor(Executor):
         self._maker = maker
         self._folder = str(folder)
         self._asked = options.workers
-        cpus, gpus = options.cpus_per_worker, options.gpus_per_worker
-        self._needs = {"CPU": cpus, "GPU": gpus}
+        gpus = options.gpus_per_worker
+        self._needs = {"CPU": 1.0, "GPU": gpus}
         self._pending: dict[Any, EpisodePlan] = {}
         self._node = ray.get_runtime_context().get_node_id()
         self._is_cut_off = False
         self._counted_at = -math.inf
         self._size = 0
         self._task = ray.remote(
-            num_cpus=cpus,
+            num_cpus=1,
             num_gpus=gpus,
             max_calls=options.recycle_after,
             max_retries=0,
@@ -71,7 +71,7 @@ class RayExecutor(Executor):
             self.close()
             raise ConfigError(
                 f"The Ray cluster has {have.get('CPU', 0):g} CPUs and {have.get('GPU', 0):g} GPUs, too few for one "
-                f"worker with {cpus:g} CPUs and {gpus:g} GPUs: lower --cpus-per-worker or --gpus-per-worker."
+                f"worker with 1 CPU and {gpus:g} GPUs: lower --gpus-per-worker, or add nodes."
             )
 
     @property

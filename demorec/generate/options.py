@@ -30,8 +30,6 @@ class RunOptions:
     """Processes on this machine, or tasks on a Ray cluster."""
     address: Rare[str] = "local"
     """Ray: address of the cluster, such as auto (that of this machine) or HOST:6379; local: only this machine."""
-    cpus_per_worker: Rare[float] = 1.0
-    """Ray: CPUs that each worker reserves."""
     gpus_per_worker: Rare[float] = 0.0
     """Ray: GPUs that each worker reserves (for --renderer egl)."""
     recycle_after: Rare[int] = 500
@@ -48,9 +46,8 @@ class RunOptions:
         check_option("num_episodes", self.num_episodes, 1, MAX_EPISODES)
         check_option("workers", self.workers, 1, 100_000)
         check_option("recycle_after", self.recycle_after, 1, 1_000_000)
-        check_option("cpus_per_worker", self.cpus_per_worker, 0.01, 1024)
         check_option("gpus_per_worker", self.gpus_per_worker, 0, 64)
-        for name in ("address", "cpus_per_worker", "gpus_per_worker"):
+        for name in ("address", "gpus_per_worker"):
             if self.executor == "local" and getattr(self, name) != getattr(RunOptions, name):
                 flag = f"--{name.replace('_', '-')}"
                 raise ConfigError(f"{flag} is for Ray: add --executor ray, or leave it out.")

@@ -7,6 +7,7 @@ kept; the same command continues from there.
 from __future__ import annotations
 
 import errno
+import os
 import signal
 import time
 from collections import Counter, deque
@@ -34,14 +35,8 @@ GRACE_S = 3.0
 """Time, s, that current episodes may continue after the first Ctrl-C."""
 _MORE_MEMORY = "try fewer --workers or a machine with more memory"
 _SOUND_STORAGE = "check the storage of the output folder, then run the same command again"
-_REFUSED = {
-    errno.ENOSPC: "the disk is full",
-    errno.EDQUOT: "the quota is used up",
-    errno.EROFS: "it is read-only",
-    errno.EFBIG: "a recording is larger than files may be there (ulimit -f)",
-    errno.EACCES: "permission is denied",
-    errno.EPERM: "permission is denied",
-}
+_REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EACCES, errno.EPERM)
+"""Errors of an output folder that stay until the user mends them."""
 _MISSING_FILE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR)
 """Errors of the user's code when it names a file wrongly."""
 
@@ -229,10 +224,10 @@ class _Driver:
 
     def _raised(self, report: Raised) -> None:
         self._folder.check_alive()
-        if report.errno in _REFUSED:
+        if report.errno is not None and report.errno in _REFUSED:
             raise GenerationError(
-                f"The output folder cannot take another episode: {_REFUSED[report.errno]}; fix that and run the same "
-                f"command again. {self._folder.kept}"
+                f"The output folder cannot take another episode ({os.strerror(report.errno)}): fix that and run the "
+                f"same command again. {self._folder.kept}"
             )
         is_own_bug = bool(report.own_line) and report.errno in _MISSING_FILE
         if report.errno is not None and report.exit_code != ConfigError.exit_code and not is_own_bug:

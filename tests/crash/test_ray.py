@@ -186,7 +186,7 @@ def test_a_node_that_ends_on_its_own_machine_ends_the_run_with_an_error(tmp_path
 
 def test_too_large_workers_are_refused(tmp_path: Path, cluster: object) -> None:
     # Ray may still count a node that an earlier test killed.
-    with pytest.raises(ConfigError, match=r"has \d CPUs and 0 GPUs, too few for one worker with 1 CPUs and 1 GPUs"):
+    with pytest.raises(ConfigError, match=r"has \d CPUs and 0 GPUs, too few for one worker with 1 CPU and 1 GPUs"):
         run_on_ray(tmp_path / "run", maker="make", gpus_per_worker=1.0)
 
 

@@ -190,7 +190,7 @@ def test_a_temporary_file_system_error_is_survived(tmp_path: Path, reference: Ru
 @pytest.mark.parametrize(
     ("maker", "error", "message"),
     [
-        ("fill_the_disk", GenerationError, "the disk is full; fix that and run the same command again"),
+        ("fill_the_disk", GenerationError, r"\(No space left on device\): fix that and run the same command again"),
         ("break_the_disk", GenerationError, r"failed to be made 5 times.*Input/output error: check the storage"),
         ("raise_a_bug", GenerationError, r"Episode 2 raised LocalError: the cube is a sphere \(the traceback is in"),
         ("raise_ours", GenerationError, r"Episode \d cannot be made: No OpenGL library was found."),
