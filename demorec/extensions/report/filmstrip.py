@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-MAX_SHOWN = 4000
+MAX_SHOWN = 1000
 """Maximum episodes that a page shows individually."""
-_TOTAL_BYTES = 13_500_000
-"""Maximum size of all filmstrips of a page; base64 adds a third, and the page stays below 30 MB."""
-_MAX_BYTES = 16_000
-"""Maximum size of one filmstrip."""
+MAX_STRIP_BYTES = 16_000
+"""Maximum size of a filmstrip; base64 adds a third, and the page stays below 30 MB."""
 _MOMENTS = 8
 _HEIGHTS = (120, 104, 88, 72, 56, 40, 28)
 """Heights in pixels; the first one that fits the size limit is used."""
@@ -42,25 +40,15 @@ class Filmstrip:
     height: int
 
 
-def strip_budget(num_episodes: int) -> int:
-    """Size limit, in bytes, of each filmstrip on a page about that many episodes."""
-    return min(_MAX_BYTES, _TOTAL_BYTES // max(1, min(num_episodes, MAX_SHOWN)))
-
-
 def filmstrip(
-    camera: str,
-    num_frames: int,
-    images_at: Callable[[Sequence[int]], Iterable[NDArray[np.uint8]]],
-    *,
-    max_bytes: int,
+    camera: str, num_frames: int, images_at: Callable[[Sequence[int]], Iterable[NDArray[np.uint8]]]
 ) -> Filmstrip | None:
-    """A strip of at most `max_bytes`; None if even the smallest is larger, or the episode is empty.
+    """A strip of limited size; None if even the smallest is larger, or the episode is empty.
 
     Args:
         camera: Camera name.
         num_frames: Number of frames of the episode.
         images_at: Ascending frame numbers -> their images, (H, W, 3) uint8.
-        max_bytes: Maximum size of the JPEG file.
     """
     if num_frames == 0:
         return None
@@ -74,7 +62,7 @@ def filmstrip(
             strip.paste(image.resize((width, height), reducing_gap=2.0), (number * width, 0))
         file = io.BytesIO()
         strip.save(file, "JPEG", quality=_QUALITY, optimize=True)
-        if file.tell() <= max_bytes:
+        if file.tell() <= MAX_STRIP_BYTES:
             return Filmstrip(
                 jpeg=file.getvalue(), camera=camera, moments=len(images), width=strip.width, height=strip.height
             )

@@ -24,7 +24,7 @@ from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recordin
 from demorec.episode.simulated import simulation_facts
 from demorec.extensions.doctor.diagnosis import Diagnosis
 from demorec.extensions.policies.statistics import Rate
-from demorec.extensions.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
+from demorec.extensions.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip
 from demorec.mcap import open_recording
 from demorec.runs.find import EPISODE_FOLDERS, Found, PathKind, expect, expect_recordings
 from demorec.runs.run_file import (
@@ -195,12 +195,12 @@ def _recordings_report(
     files = (*found.recordings, *found.failed)
     expect_recordings(found, files)
     run, missing = _run_file(found)
-    stride, budget = -(-len(files) // MAX_SHOWN), strip_budget(len(files))
+    stride = -(-len(files) // MAX_SHOWN)
     components: Components = {}
     episodes: list[ReportedEpisode] = []
     for number, file in enumerate(files):
-        strip_bytes = 0 if number % stride and file.parent.name != FAILED else budget
-        episode = _read(partial(open_recording, file), file, named, camera, strip_bytes, components)
+        has_strip = number % stride == 0 or file.parent.name == FAILED
+        episode = _read(partial(open_recording, file), file, named, camera, has_strip, components)
         source = file.name if file == found.path else file.relative_to(found.path).as_posix()
         episodes.append(_judged(replace(episode, source=source), number, diagnosis))
         advance(len(episodes), len(files))
@@ -227,14 +227,14 @@ def _dataset_report(
     root: Path, camera: str, diagnosis: Diagnosis | None, named: NamedRoles, advance: _Progress
 ) -> Report:
     folder = LeRobotFolder(root, named=named)
-    stride, budget = max(1, -(-len(folder.places) // MAX_SHOWN)), strip_budget(len(folder.places))
+    stride = max(1, -(-len(folder.places) // MAX_SHOWN))
     flagged = set() if diagnosis is None else {finding.episode for finding in diagnosis.findings}
     without_videos = folder.leave_out_missing_cameras()
     components: Components = {}
     episodes: list[ReportedEpisode] = []
     for number, place in enumerate(folder.places):
-        strip_bytes = budget if place.episode_index in flagged or number % stride == 0 else 0
-        episode = _read(partial(_stored, folder, number), root, folder.roles, camera, strip_bytes, components)
+        has_strip = number % stride == 0 or place.episode_index in flagged
+        episode = _read(partial(_stored, folder, number), root, folder.roles, camera, has_strip, components)
         episode = replace(episode, name=f"episode {place.episode_index}")
         episodes.append(_judged(episode, place.episode_index, diagnosis))
         advance(len(episodes), len(folder.places))
@@ -265,7 +265,7 @@ def _read(
     path: Path,
     roles: Roles | NamedRoles,
     camera: str,
-    strip_bytes: int,
+    has_strip: bool,
     components: Components,
 ) -> ReportedEpisode:
     """Read an episode and add its motion to the components; a damaged one is reported as damaged."""
@@ -277,9 +277,8 @@ def _read(
                 raise ConfigError(f"No camera {camera!r}, available are {there}: {path}")
             cameras = [name for name in episode.cameras if camera in ("", name) and len(table.image_stamps[name])]
             strip = None
-            if strip_bytes and cameras:
-                images_at = partial(episode.images_at, cameras[0])
-                strip = filmstrip(cameras[0], episode.num_frames, images_at, max_bytes=strip_bytes)
+            if has_strip and cameras:
+                strip = filmstrip(cameras[0], episode.num_frames, partial(episode.images_at, cameras[0]))
             add_motion(
                 components,
                 roles if isinstance(roles, Roles) else roles_of_recording(info, roles),
