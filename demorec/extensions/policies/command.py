@@ -196,13 +196,10 @@ def _correction_lines(evaluation: Evaluation, out: Path) -> Iterator[str]:
     from demorec.extensions.policies.turns import read_takeover
 
     config = evaluation.settings.config
-    found = [read_takeover(out / rollout.file) for rollout in evaluation.rollouts]
-    frames = sum(taken.num_frames for taken in found if taken is not None)
-    total = sum(rollout.num_frames for rollout in evaluation.rollouts)
+    reasons = [read_takeover(out / rollout.file) for rollout in evaluation.rollouts]
     yield f"policy        {evaluation.settings.policy_type} {evaluation.settings.policy_digest}"
     yield f"scenes        {config.task}, split {config.split}, seed {config.seed}"
-    yield f"by itself     {sum(taken is None for taken in found)} of {len(found)} episodes"
-    yield from _counts("taken over", (taken.reason for taken in found if taken is not None))
+    yield f"by itself     {reasons.count('')} of {len(reasons)} episodes"
+    yield from _counts("taken over", filter(None, reasons))
     yield f"success       {evaluation.rate} (Wilson 95 %) in the end"
-    yield f"expert acted  {frames} of {total} frames"
     yield f"recordings    {out / 'episodes'}, {out / 'failed'}"

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -264,22 +264,12 @@ def _place(observation: Observation) -> Array:
     return np.array([*observation.base_from_tcp.position, observation.gripper_width])
 
 
-class TakenOver(NamedTuple):
-    """The correction in a recording: the reason of the takeover, and the number of the expert's frames."""
-
-    reason: str
-    num_frames: int
-
-
-def read_takeover(path: Path) -> TakenOver | None:
-    """Read the correction in a rollout's recording; None if the policy acted to the end.
+def read_takeover(path: Path) -> str:
+    """Read the reason of the takeover in a rollout's recording; "" if the policy acted to the end.
 
     Raises:
         RecordingError: It cannot be read.
     """
     with open_simulated(path) as recording:
-        messages = [event.message for _, event in recording.events() if event.name == TAKE_OVER_EVENT]
-        if not messages:
-            return None
-        num_frames = sum(phase != POLICY_PHASE for phase in recording.phases)
-    return TakenOver(reason=messages[0].removeprefix(_MESSAGE), num_frames=num_frames)
+        messages = (event.message for _, event in recording.events() if event.name == TAKE_OVER_EVENT)
+        return next(messages, "").removeprefix(_MESSAGE)
