@@ -13,15 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Finding
+from demorec.cli.shared.output import size_in_words
 from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
-from demorec.core.replacing import shown
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.episode.element_names import is_numbered
 from demorec.episode.episode import Outcome
 from demorec.episode.protocol import Episode
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recording
-from demorec.episode.simulated import simulation_facts
 from demorec.extensions.doctor.diagnosis import Diagnosis
 from demorec.extensions.policies.statistics import Rate
 from demorec.extensions.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip
@@ -62,7 +61,6 @@ class ReportedEpisode:
         flags: Findings of checks, broken ones first.
         score: Score by the doctor; 1 for a good or unjudged episode.
         filmstrip: None without images, and for some successes in a long report.
-        facts: (name, value) for the summary of all episodes: robot, cameras, ...
     """
 
     name: str
@@ -75,7 +73,6 @@ class ReportedEpisode:
     flags: tuple[Finding, ...] = ()
     score: float = 1.0
     filmstrip: Filmstrip | None = None
-    facts: tuple[tuple[str, str], ...] = ()
 
     @property
     def success(self) -> bool | None:
@@ -293,25 +290,11 @@ def _read(
                 num_frames=episode.num_frames,
                 fps=info.fps,
                 filmstrip=strip,
-                facts=tuple(_facts_of(episode)),
             )
     except (RecordingError, ExportError) as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
         return ReportedEpisode(name=path.stem, problem=without_path(error, path).replace(f"{path}/", ""))
-
-
-def _facts_of(episode: Episode) -> Iterator[tuple[str, str]]:
-    info, simulated = episode.info, simulation_facts(episode.info)
-    if simulated:
-        yield "task", simulated["task"]
-    yield "robot", info.robot_name
-    videos = ((name, episode.video_settings(name)) for name in episode.cameras)
-    yield "cameras", ", ".join(f"{name} {video.width}x{video.height}" for name, video in videos) or "none"
-    if simulated:
-        yield "root seed", str(simulated["root_seed"])
-    if version := info.versions.get("demorec"):
-        yield "made with", f"demorec {version}"
 
 
 def _judged(episode: ReportedEpisode, number: int, diagnosis: Diagnosis | None) -> ReportedEpisode:
@@ -329,19 +312,8 @@ def _common_facts(episodes: Sequence[ReportedEpisode], files: Iterable[Path]) ->
     if rate.trials:
         yield "success", f"{rate}"
     seconds = sum(episode.num_frames / episode.fps for episode in episodes)
-    unit, factor = ("h", 3600) if seconds >= 7200 else ("min", 60) if seconds >= 120 else ("s", 1)
-    rates = _few(f"{episode.fps} Hz" for episode in episodes if episode.num_frames)
-    yield "frames", f"{sum(episode.num_frames for episode in episodes):,} ({seconds / factor:.1f} {unit} at {rates})"
-    size = sum(file.stat().st_size for file in files)
-    yield "size", f"{size / 1000:.0f} kB" if size < 1_000_000 else f"{size / 1e6:.1f} MB"
-    facts = [fact for episode in episodes for fact in episode.facts]
-    for name in dict.fromkeys(name for name, _ in facts):
-        yield name, _few(value for of, value in facts if of == name)
-
-
-def _few(values: Iterable[str]) -> str:
-    """The first three distinct values."""
-    return shown(list(dict.fromkeys(values)), 3) or "unknown"
+    yield "frames", f"{sum(episode.num_frames for episode in episodes):,} ({seconds:.1f} s)"
+    yield "size", size_in_words(sum(file.stat().st_size for file in files))
 
 
 def _run_file(found: Found) -> tuple[RunFile | None, tuple[str, ...]]:
