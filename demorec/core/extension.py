@@ -59,8 +59,6 @@ class ReaderRow:
         for a format without `suggester` also of motors, named, episodes and skip_bad, as in `dataset_import`.
         suggester: "module:function" of (path, tell) that returns the lines of a mapping; it calls `tell` with each open
         decision. "" for a format that needs no mapping.
-        reviewer: "module:function" of a mapping's path: its features and cameras in words; ConfigError if a decision is
-        open. Needed with a `suggester`.
         describer: "module:function" of a path: yields (plain data, lines) for `demorec info`, without a mapping; "" if
         `info` reads it through an import.
         dropped: "module:function" of an imported run: the data left out, as rows of "bag", "what" and "reason".
@@ -74,7 +72,6 @@ class ReaderRow:
     example: str
     importer: str
     suggester: str = ""
-    reviewer: str = ""
     describer: str = ""
     dropped: str = ""
 

@@ -102,15 +102,10 @@ def _suggested(path: Path, form: ReaderRow, target: Path, tell: Tell) -> Path:
     doubts: list[str] = []
     target.write_text("\n".join(pkgutil.resolve_name(form.suggester)(path, doubts.append)) + "\n", encoding="utf-8")
     suggest = f"{form.command} {shlex.quote(str(path))} --suggest > mapping.toml"
-    try:
-        if doubts:
-            raise ConfigError(doubts[0])
-        taken = pkgutil.resolve_name(form.reviewer)(target)
-    except ConfigError as error:
-        reason = str(error).removesuffix(f": {target}").removesuffix(".")
+    if doubts:
         raise ConfigError(
-            f"This is read by a mapping (--mapping FILE), and the suggested one leaves a decision to you: {reason}; "
-            f"{suggest} writes it: {path}"
-        ) from error
-    tell(f"{path}: read by the suggested mapping ({taken}); {suggest} writes it, --mapping takes another.")
+            f"This is read by a mapping (--mapping FILE), and the suggested one leaves a decision to you: "
+            f"{doubts[0].removesuffix('.')}; {suggest} writes it: {path}"
+        )
+    tell(f"{path}: read by the suggested mapping; {suggest} writes it, --mapping takes another.")
     return target

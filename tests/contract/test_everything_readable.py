@@ -252,7 +252,7 @@ def test_omissions_and_the_mapping_are_reported(
     assert exit_code("check", source) in (0, 1)  # the small file has faults
     printed = capsys.readouterr()
     assert printed.out.startswith(f"{source}: ")
-    assert f"{source}: read by the suggested mapping (observation.state from obs/robot0_joint_pos and" in printed.err
+    assert f"{source}: read by the suggested mapping; demorec import hdf5 " in printed.err
     assert "because the mapping does not name them: dones, next_obs, rewards, states." in printed.err
 
 

@@ -165,6 +165,8 @@ def suggested_hdf5_mapping(path: Path, tell: Callable[[str], None]) -> list[str]
         features = [*_features(contents, layout)]
         if _NO_STATE in features:
             tell(_NO_STATE.removeprefix("# "))
+        if not any(name in contents.arrays for name in layout.actions):
+            tell("No dataset is known to be the action: write [[features.action]].")
         return [*lines, *features, *_cameras(contents, layout)]
 
 

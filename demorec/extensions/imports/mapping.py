@@ -68,11 +68,6 @@ class Source:
     max_age_s: float | None = _bag(None)
     dataset: str = _hdf5("")
 
-    @property
-    def place(self) -> str:
-        """Location of its numbers, for people."""
-        return f"the next {self.next}" if self.next else self.dataset or f"{self.topic} {self.field}"
-
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSource:

@@ -6,7 +6,6 @@ import dataclasses
 import tomllib
 import typing
 from collections.abc import Iterator
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,6 @@ from demorec.extensions.imports.mapping import (
 )
 
 _MAX_FILE_BYTES = 1 << 20
-_MAX_REVIEWED = 6
-"""Maximum features and cameras of a mapping that are listed."""
 _KINDS: dict[SourceKind, str] = {"bag": "bags", "hdf5": "HDF5 files"}
 
 
@@ -58,19 +55,6 @@ def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
     if problems := list(_problems(mapping)):
         raise ConfigError(f"The mapping cannot be used: {listed(problems)}: {path}")
     return mapping
-
-
-def review_mapping(path: Path, kind: SourceKind = "bag") -> str:
-    """Features and cameras of a mapping, in words; errors as in `read_mapping`."""
-    mapping = read_mapping(path, kind)
-    parts = [
-        f"{name} from {' and '.join(dict.fromkeys(source.place for source in of))}"
-        for name, of in mapping.features.items()
-    ]
-    return listed([*parts, *(f"camera {name}" for name in mapping.cameras)], _MAX_REVIEWED, ", ")
-
-
-review_hdf5_mapping = partial(review_mapping, kind="hdf5")
 
 
 def _unknown_keys(value: Any, kind: Any, place: str, of: SourceKind) -> Iterator[str]:

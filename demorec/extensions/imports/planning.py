@@ -116,7 +116,7 @@ def _info(bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, settings:
 
 def _feature(name: str, dtype: DTypeLike, lines: Timelines) -> Feature:
     sources = lines.mapping.features[name]
-    places = [f"{source.next} of the next frame" if source.next else source.place for source in sources]
+    places = [f"{one.next} of the next frame" if one.next else f"{one.topic} {one.field}" for one in sources]
     streams = [lines.lines[key].stream for key, _ in lines.sources(name)]
     names = tuple(element for stream in streams for element in stream.names)
     units = (stream.unit for stream in streams for _ in stream.names)

@@ -216,6 +216,8 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
         lines += [f"# ATTENTION: {warning}", "#"]
     lines += [f"# {problem}" for problem in problems[:_MAX_PROBLEMS]]
     lines += _listed(topics)
+    if not task_in_name(bag.name):
+        tell("The name of the bag does not describe the task: write [task] text.")
     robot = re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
     models = (name for name in topics if name.endswith("robot_description"))
     model = min(models, key=lambda name: (name.count("/"), name), default="")  # nested ones may belong to objects
