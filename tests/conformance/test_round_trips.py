@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.commands import exit_code
 from support.export import export, make_run, recordings
-from support.external import TOP, Episode, make_external, write_external
+from support.external import TOP, URDF, Episode, make_external, write_external
 
 from demorec.core.geometry import Pose
 from demorec.core.text import printable
@@ -74,7 +74,8 @@ def test_round_trip_of_another_robot(
     export(run, tmp_path / "a", exporter, **options)
     if exporter == "hdf5":
         assert exit_code("import", "hdf5", tmp_path / "a", "--suggest") == 0
-        (tmp_path / "again.toml").write_text(capsys.readouterr().out)
+        (tmp_path / "again.toml").write_text(capsys.readouterr().out.replace("# urdf = ", "urdf = "))
+        (tmp_path / "robot.urdf").write_text(URDF)
     again = imported(exporter, tmp_path / "a", tmp_path / "again")
     for before, after in zip(recordings(run), recordings(again), strict=True):
         with Recording(before) as there, Recording(after) as here:
