@@ -12,7 +12,7 @@ from pathlib import Path
 from PIL import Image, ImageDraw, ImageFont
 
 from demorec.mcap import Recording
-from demorec.view.style import phase_colors
+from demorec.view.style import name_colors
 
 WIDTH, HEIGHT, GAP, BAR = 480, 360, 4, 32
 SHOWN_SIZE = (723, 297)
@@ -25,7 +25,7 @@ DARK = (24, 28, 34)
 def draw_bar(canvas: Image.Image, phases: list[str], frame: int) -> None:
     """Draw the phases over time, the current time, and the name of the current phase."""
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=17)
-    colors, width, top = phase_colors(phases), canvas.width, HEIGHT + GAP
+    colors, width, top = name_colors(phases), canvas.width, HEIGHT + GAP
     for index, phase in enumerate(phases):
         left, right = index * width // len(phases), (index + 1) * width // len(phases)
         draw.rectangle((left, top, right, top + BAR), fill=colors[phase])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from demorec.episode.scene import Scene
 from demorec.view.episode import Distances, Playback
 from demorec.view.paths import Paths, indexes, log_pose, send_poses
-from demorec.view.style import FRUSTUM, segment_colors
+from demorec.view.style import FRUSTUM, name_colors
 
 _CODECS = {"h264": rr.VideoCodec.H264, "h265": rr.VideoCodec.H265, "av1": rr.VideoCodec.AV1}
 _PACKETS_AT_ONCE = 256
@@ -98,6 +98,6 @@ def _log_segmentations(recording: rr.RecordingStream, episode: Playback) -> None
         _send_images(recording, entity, episode.time_ns, numbers, rr.SegmentationImage)
     if segment_names:
         names = {number: segment_names[value] for number, value in enumerate(known.tolist()) if number > 0}
-        colors = segment_colors(names.values())
+        colors = name_colors(names.values())
         labels = [rr.AnnotationInfo(number, name, colors[name]) for number, name in names.items()]
         recording.log(Paths.world, rr.AnnotationContext(labels), static=True)

@@ -18,7 +18,6 @@ from demorec.core.errors import RecordingError, describe_error, resource_error
 from demorec.core.geometry import Array, Pose
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.recording import DatasetRecording, with_robot
-from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.protocol import SceneMotion
@@ -78,7 +77,7 @@ class _ShownEpisode(DatasetRecording):
 
 
 class _SimulatedEpisode(DatasetRecording):
-    """An episode simulated by demorec, with scene and outcome from the sidecar.
+    """An episode simulated by demorec, with the scene and the phases from the sidecar.
 
     Raises ValueError, TypeError, KeyError or IndexError for unexpected values in its tables.
     """
@@ -98,13 +97,6 @@ class _SimulatedEpisode(DatasetRecording):
     @property
     def _spec(self) -> RobotSpec:
         return self.info.simulated.robot
-
-    @cached_property
-    def outcome(self) -> Outcome:
-        """Outcome of the episode."""
-        names = ("success", "failure_phase", "failure_reason", "num_retries", "final_state_digest")
-        checks = tuple(SuccessCheck(**check) for check in self._row["checks"])
-        return Outcome(num_frames=self.num_frames, checks=checks, **{name: self._row[name] for name in names})
 
     @property
     def phases(self) -> tuple[str, ...]:

@@ -11,7 +11,6 @@ import numpy as np
 import rerun as rr
 
 from demorec.core.errors import RecordingError, write_error
-from demorec.episode.episode import Outcome
 from demorec.episode.simulated import simulation_facts
 from demorec.view.bodies import log_bodies, log_robot
 from demorec.view.cameras import log_cameras
@@ -19,7 +18,7 @@ from demorec.view.episode import FORCE_CURVES, Playback
 from demorec.view.layout import episode_layout
 from demorec.view.paths import Paths, indexes
 from demorec.view.sources import PlaybackSource
-from demorec.view.style import ASKED, FORCE, MEASURED, TARGET, Color, phase_colors, series_colors
+from demorec.view.style import ASKED, FORCE, MEASURED, TARGET, Color, name_colors, series_colors
 
 _HEADINGS = {"subtask": "Now", "motion": "Motion", "plan": "Plan", "memory": "So far"}
 """Kind of statement -> its heading, in the order of the page."""
@@ -67,7 +66,7 @@ def _log_ee_path(recording: rr.RecordingStream, episode: Playback) -> None:
         return
     points = episode.world_from_base.apply(episode.motion.base_from_tcp[:, :3])
     phases = episode.data.phases or ("",) * episode.num_frames
-    colors = phase_colors(phases)
+    colors = name_colors(phases)
     recording.log(Paths.ee_path, rr.LineStrips3D.from_fields(radii=[-2.0]), static=True)
     columns = rr.LineStrips3D.columns(
         strips=np.stack([points[:-1], points[1:]], axis=1), colors=[colors[name] for name in phases[1:]]
@@ -89,7 +88,7 @@ def _log_curves(recording: rr.RecordingStream, episode: Playback) -> None:
 
 
 def _log_phases(recording: rr.RecordingStream, episode: Playback) -> None:
-    colors = phase_colors(episode.data.phases)
+    colors = name_colors(episode.data.phases)
     if not colors or set(colors) == {""}:
         return
     recording.log(Paths.phase, rr.StateConfiguration(values=list(colors), colors=list(colors.values())), static=True)
@@ -103,7 +102,7 @@ def _phase_starts(episode: Playback) -> list[int]:
 
 
 def _log_events(recording: rr.RecordingStream, episode: Playback) -> None:
-    colors = phase_colors(episode.data.phases)
+    colors = name_colors(episode.data.phases)
     rows: list[tuple[int, str, str, Color]] = [
         (int(episode.time_ns[i]), "INFO", episode.data.phases[i], colors[episode.data.phases[i]])
         for i in _phase_starts(episode)
@@ -159,24 +158,15 @@ def _origin(episode: Playback) -> str:
 
 
 def _summary(episode: Playback) -> str:
-    """Write Markdown: task, outcome and its checks, failed ones first."""
+    """Write Markdown: task, length, outcome and origin."""
     info, facts = episode.info, simulation_facts(episode.info)
     about = [facts.get("task", info.robot_name), f"episode {info.episode_index}"]
     about += [f"seed {facts['root_seed']}"] if facts else []
     length = f"{episode.duration:.1f} s · {episode.num_frames} frames (nominal {info.fps} Hz)"
-    origin, checks = _origin(episode), [] if episode.data.outcome is None else _checks(episode.data.outcome)
     parts = [f"**{info.instruction}**", " · ".join(about), length, f"Outcome: **{episode.verdict}**"]
-    return "\n\n".join([*parts, *([f"Origin: {origin}"] if origin else []), *checks]) + "\n"
-
-
-def _checks(outcome: Outcome) -> list[str]:
-    """Write a table of the success conditions, failed ones first."""
-    rows = ["| | check | value | limit |", "|---|---|---|---|"]
-    for check in sorted(outcome.checks, key=lambda check: check.passed):
-        mark = "✓" if check.passed else "**✗**"
-        unit = f" {check.unit}" if check.unit else ""
-        rows.append(f"| {mark} | {check.name} | {check.value:.3g}{unit} | {check.limit:.3g}{unit} |")
-    return ["\n".join(rows)] if outcome.checks else []
+    if origin := _origin(episode):
+        parts.append(f"Origin: {origin}")
+    return "\n\n".join(parts) + "\n"
 
 
 def save(source: PlaybackSource, target: Path) -> None:

@@ -1,4 +1,4 @@
-"""Colours: one palette for joints, one for the phases of a motion, the same in plots, paths and timelines."""
+"""Colours: one palette, the same in plots, paths, timelines and segments."""
 
 from __future__ import annotations
 
@@ -17,21 +17,8 @@ SERIES: tuple[Color, ...] = (
     (150, 210, 80),
     (200, 200, 200),
 )
-"""Colours of the joints, base to fingers; after Okabe and Ito, distinguishable for colour-blind people."""
-
-PHASES: tuple[Color, ...] = (
-    (70, 130, 255),
-    (0, 200, 200),
-    (255, 200, 40),
-    (60, 200, 90),
-    (190, 110, 255),
-    (255, 130, 50),
-    (240, 80, 110),
-    (150, 160, 180),
-    (165, 105, 60),
-    (255, 170, 205),
-)
-"""Colours of the phases, in the order of their appearance."""
+"""Colours of joints, phases and segments, in their order; after Okabe and Ito, distinguishable for colour-blind people.
+"""
 
 MEASURED: Color = (86, 180, 233)
 TARGET: Color = (255, 170, 60)
@@ -47,11 +34,6 @@ def series_colors(count: int) -> list[Color]:
     return [SERIES[index % len(SERIES)] for index in range(count)]
 
 
-def phase_colors(phases: Iterable[str]) -> dict[str, Color]:
-    """Map each phase to a colour."""
-    return {name: PHASES[index % len(PHASES)] for index, name in enumerate(dict.fromkeys(phases))}
-
-
-def segment_colors(names: Iterable[str]) -> dict[str, Color]:
-    """Map each segment to a colour."""
-    return {name: SERIES[index % len(SERIES)] for index, name in enumerate(names)}
+def name_colors(names: Iterable[str]) -> dict[str, Color]:
+    """Map each name, such as that of a phase or segment, to a colour."""
+    return {name: SERIES[index % len(SERIES)] for index, name in enumerate(dict.fromkeys(names))}
