@@ -202,6 +202,15 @@ def test_names_keep_their_form(
     assert (found["dtype"], found["shape"], found["names"]) == ("float64", [3], names if fits else None)
 
 
+def test_a_camera_may_have_any_name(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The columns of its ranges end in from_timestamp and to_timestamp."""
+    name = "observation.images.photo_to_top"
+    assert exit_code("dataset", "rename", whole, f"{TOP}={name}", "--out", tmp_path / "named") == 0
+    capsys.readouterr()
+    assert repair(tmp_path / "named", "--dry-run") == 0
+    assert capsys.readouterr().out.startswith("Nothing to repair")
+
+
 def test_splits_are_kept_where_episodes_keep_their_numbers(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -250,6 +259,7 @@ def test_wrong_paths_a_camera_without_videos_and_counters_as_floats(tmp_path: Pa
     ghost = {"dtype": "video", "shape": [64, 96, 3], "names": None}
     edit_json(roots[1] / "meta/info.json", lambda data: data["features"].update({"observation.images.ghost": ghost}))
     info(data_path="data/chunk-{episode_index:03d}/episode_{episode_index:06d}.parquet")(roots[1])
+    (roots[1] / "meta/episodes.jsonl").unlink()
     assert repair(roots[1], "--out", tmp_path / "new") == 0
     assert exit_code("dataset", "select", roots[0], "--episodes", "0,1", "--out", tmp_path / "expected") == 0
     found, expected = items(tmp_path / "new"), items(tmp_path / "expected")
