@@ -114,10 +114,10 @@ def _card(root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mappi
     tables = [read_table(path, ["root_seed"]) for path in tables_in(root, f"{SIDECAR_DIR}/episodes")]
     seeds = [seed for table in tables for seed in table.column("root_seed").to_pylist()]
     # recordings of other robots have no seed, episodes of other writers no row
-    is_simulated = None not in seeds and len(seeds) == info.total_episodes
+    has_seeds = None not in seeds and len(seeds) == info.total_episodes
     meaning = {name: markdown(text) for name, text in meanings.items()}
     meaning |= dict.fromkeys((name for name, item in info.features.items() if item.is_depth), _DEPTH_MEANING)
-    if is_simulated:
+    if has_seeds:
         meaning[ACTION] = _ACTION_MEANING[options.action]
     features = []
     for key, item in info.features.items():
@@ -127,23 +127,23 @@ def _card(root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mappi
     listed = [f"- {markdown(task)}" for task in tasks[:_MAX_TASKS]]
     if len(tasks) > _MAX_TASKS:
         listed.append(f"- and {len(tasks) - _MAX_TASKS} more")
-    licence = options.license or ("apache-2.0" if is_simulated else "")
+    licence = options.license or ("apache-2.0" if has_seeds else "")
     return _CARD.format(
         license=f"license: {licence}\n" if licence else "",
-        simulation="- simulation\n" if is_simulated else "",
+        simulation="- simulation\n" if has_seeds else "",
         repo_id=options.repo_id,
-        summary=_summary(info, is_simulated=is_simulated),
+        summary=_summary(info, has_seeds=has_seeds),
         tasks="\n".join(listed),
         features="\n".join(features),
-        rows=_SIMULATED_ROWS if is_simulated else _RECORDED_ROWS,
+        rows=_SIMULATED_ROWS if has_seeds else _RECORDED_ROWS,
     )
 
 
-def _summary(info: DatasetInfo, *, is_simulated: bool) -> str:
+def _summary(info: DatasetInfo, *, has_seeds: bool) -> str:
     demonstrations = "demonstration" if info.total_episodes == 1 else "demonstrations"
     robot, minutes = markdown(str(info.robot_type)), info.total_frames / info.fps / 60
     scripted = f"scripted {demonstrations} by a simulated {robot} arm in PyBullet"
-    content = scripted if is_simulated else f"{demonstrations} of {robot}"
+    content = scripted if has_seeds else f"{demonstrations} of {robot}"
     return (
         f"{info.total_episodes} {content}, {info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), "
         "in the LeRobot v3.0 format. Exported by demorec."
