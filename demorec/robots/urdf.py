@@ -225,7 +225,7 @@ def quat_from_rpy(rpy: Sequence[float]) -> Array:
     )
 
 
-UrdfShapeKind = Literal["box", "sphere", "cylinder", "capsule", "mesh", "plane"]
+UrdfShapeKind = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,7 +235,7 @@ class UrdfShape:
     Attributes:
         kind: Geometry; decides the meaning of `size`.
         size: box: (x, y, z) full extents, metres; sphere: (radius,); cylinder and capsule: (radius, length) along z;
-            mesh: (x, y, z) scale factors of the file; plane: ().
+            mesh: (x, y, z) scale factors of the file.
             file: mesh: name in the URDF (`demorec.robots.assets.mesh_path` finds it); otherwise "".
             link_from_shape: Pose in the link's frame.
             rgba: Colour of its material, 0..1; None if the material has no colour.
@@ -306,8 +306,6 @@ def _shape(element: ET.Element, geometry: ET.Element, scale: float, colors: dict
             size = read_numbers(geometry.get("scale", "1 1 1"), 3)
         case "sphere":
             size = read_numbers(geometry.attrib["radius"], 1)
-        case "plane":
-            size = []
         case _:
             size = read_numbers(f"{geometry.attrib['radius']} {geometry.attrib['length']}", 2)
     material = element.find("material")

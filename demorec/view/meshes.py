@@ -86,7 +86,7 @@ def urdf_meshes(
     links = {}
     for link in read_links(text, scale=scale):
         try:
-            shapes = [_shape_mesh(shape, folder) for shape in link.visuals if shape.kind != "plane"]
+            shapes = [_shape_mesh(shape, folder) for shape in link.visuals]
         except DemorecError as error:
             if failures is None:
                 raise
