@@ -149,21 +149,23 @@ def dataset_digest(path: Path) -> str:
     return combined_digest(folder.info, episode_digests(folder))
 
 
-def episode_digests(folder: LeRobotFolder, numbers: Sequence[int] | None = None) -> list[str]:
-    """Compute the digests of some episodes, by default all, in order, from all files."""
+def episode_digests(folder: LeRobotFolder) -> list[str]:
+    """Compute the digests of all episodes, in order, from all files."""
+    rows = folder.rows(folder.columns)
+    return [content_digest(folder, rows, place) for place in folder.places]
+
+
+def content_digest(folder: LeRobotFolder, rows: DataRows, place: EpisodePlace) -> str:
+    """Compute the digest of an episode from all columns and videos."""
     if unknown := without_digest(folder.info):
         raise ExportError(
             f"The content of {', '.join(unknown)} has no digest, because it is neither video nor numbers: {folder.root}"
         )
-    rows = folder.rows(folder.columns)
-    found: list[str] = []
-    for place in folder.places if numbers is None else [folder.listed[number] for number in numbers]:
-        columns = rows.numbers(place)
-        task_index = columns["task_index"][0, 0] if len(columns["task_index"]) else -1
-        if not 0 <= task_index < len(folder.tasks):  # NaN, the value of a null, is neither
-            raise ExportError(f"Episode {place.episode_index} has no task: {folder.root}")
-        found.append(episode_digest(folder.tasks[int(task_index)], columns, video_digests(folder, place)))
-    return found
+    columns = rows.numbers(place)
+    task_index = columns["task_index"][0, 0] if len(columns["task_index"]) else -1
+    if not 0 <= task_index < len(folder.tasks):  # NaN, the value of a null, is neither
+        raise ExportError(f"Episode {place.episode_index} has no task: {folder.root}")
+    return episode_digest(folder.tasks[int(task_index)], columns, video_digests(folder, place))
 
 
 def video_digests(folder: LeRobotFolder, place: EpisodePlace) -> dict[str, str]:
