@@ -25,8 +25,6 @@ class SceneMotion:
     joint_position: Mapping[str, Array] = field(default_factory=dict)  # joint of the URDF -> (T,) rad or m
     base_from_tcp: Array | None = None  # (T, 7), None if unknown
     object_poses: Mapping[str, Array] = field(default_factory=dict)  # name -> (T, 7), world_from_object
-    # Name -> (7,) pose of an object at the end, for sources that may not know its trajectory.
-    end_poses: Mapping[str, Array] = field(default_factory=dict)
     world_from_camera: Mapping[str, Array] = field(default_factory=dict)  # name -> (T, 7)
 
 

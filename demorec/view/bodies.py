@@ -31,7 +31,7 @@ _ROD_RADIUS = 0.015
 
 
 def log_bodies(recording: rr.RecordingStream, episode: Playback, scene: Scene) -> None:
-    """Log every body at its pose or along its trajectory, and wire frames of goals and known final poses of objects.
+    """Log every body at its pose or along its trajectory, and wire frames of goals.
 
     A body with a model that is missing here, or differs from the recorded one, is drawn as the recording describes it.
     """
@@ -43,10 +43,6 @@ def log_bodies(recording: rr.RecordingStream, episode: Playback, scene: Scene) -
             send_poses(recording, entity, episode.time_ns, poses)
         else:
             log_pose(recording, entity, body.world_from_body.vector())
-    for name, pose in episode.motion.end_poses.items():
-        wire = rr.Boxes3D(sizes=[scene.body(name).shape.extents], colors=[(200, 200, 200)], radii=[-1.0])
-        log_pose(recording, Paths.end(name), pose)
-        recording.log(Paths.end(name), wire, static=True)
     for goal in scene.goals:
         wire = rr.Boxes3D(sizes=[scene.body(goal.object).shape.extents], colors=[GOAL], radii=[-1.5])
         log_pose(recording, Paths.goal(goal.object), scene.world_from_goal(goal).vector())

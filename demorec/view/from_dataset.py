@@ -1,6 +1,6 @@
 """Episodes of exported datasets: numbers from the data files, the scene from demorec's own tables.
 
-A dataset without environment state has only the first and last pose of each object.
+A dataset without environment state has only the first pose of each object.
 """
 
 from __future__ import annotations
@@ -112,13 +112,11 @@ class _SimulatedEpisode(DatasetRecording):
         data = {name: values.astype(np.float64) for name, values in self.table().features.items()}
         state, count = data[STATE], len(self._spec.arm_joints)
         fingers = self._spec.gripper.joint_position(state[:, count])
-        ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in self._row["objects"]}
         poses = self._object_poses(data[ENVIRONMENT_STATE]) if ENVIRONMENT_STATE in data else {}
         return SceneMotion(
             joint_position=dict(zip(self._spec.joint_names, [*state[:, :count].T, *fingers.T], strict=True)),
             base_from_tcp=data.get(EE_POSE),
             object_poses=poses,
-            end_poses=ends,
             world_from_camera=self._camera_poses(data[EE_POSE]) if EE_POSE in data else {},
         )
 
@@ -142,14 +140,6 @@ class _SimulatedEpisode(DatasetRecording):
             poses = (scene.robot.world_from_base @ Pose(position=row[:3], quat_xyzw=row[3:]) for row in rows)
             result[body.name] = np.array([pose.vector() for pose in poses])
         return result
-
-
-def _pose_row(values: Any) -> Array:
-    """Convert a table's value to position and quaternion (7,); ValueError if invalid."""
-    pose = np.array(values, dtype=np.float64)
-    if pose.shape != (7,) or not np.isfinite(pose).all():
-        raise ValueError(f"{str(values)[:40]} is not a pose")
-    return pose
 
 
 def _phases(row: dict[str, Any], num_frames: int) -> tuple[str, ...]:

@@ -42,11 +42,6 @@ class Paths:
         return f"/world/goals/{name}"
 
     @staticmethod
-    def end(name: str) -> str:
-        """Path of an object's final pose; not below the goal, because the goal's transform would apply to it."""
-        return f"/world/ends/{name}"
-
-    @staticmethod
     def camera(name: str, more: Literal["", "/depth", "/segmentation"] = "") -> str:
         """Path of a camera's pose, pinhole and images; or of its other images."""
         return f"/world/cameras/{name}{more}"
