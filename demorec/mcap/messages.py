@@ -202,15 +202,8 @@ def read_label_info(data: bytes) -> dict[int, str]:
     return {item["class_id"]: item["class_name"] for item in decode(LABEL_INFO, data)[0]["class_map"]}
 
 
-Value = bool | int | float | str | bytes
-
-
-def message_fields(schema: str, data: bytes) -> dict[str, Value]:
-    """Decode a recording's message to its fields, in order: `pose.position.x` or `position[3]` -> value.
-
-    A sequence also has its length, as `position.length`; octets (an encoded image) are one value. ValueError unless the
-    message is of this type, which recordings use.
-    """
+def message_fields(schema: str, data: bytes) -> dict[str, Any]:
+    """Decode a recording's message to its fields, in order; ValueError unless it is of this type, which recordings use."""
     if schema == PROTOBUF_VIDEO:
         return dict(protobuf_fields(data))
     if schema not in DEFINITIONS:
@@ -218,19 +211,4 @@ def message_fields(schema: str, data: bytes) -> dict[str, Value]:
     values, num_left = decode(schema, data)
     if num_left:
         raise ValueError(f"a message with {num_left} excess bytes")
-    return dict(_leaves("", values))
-
-
-def _leaves(path: str, value: Any) -> Iterator[tuple[str, Value]]:
-    """Yield path and value of every field in a part of a message."""
-    if isinstance(value, dict):
-        for name, part in value.items():
-            yield from _leaves(f"{path}.{name}" if path else name, part)
-    elif isinstance(value, np.ndarray) and value.dtype == np.uint8:
-        yield path, value.tobytes()
-    elif isinstance(value, list | np.ndarray):
-        yield f"{path}.length", len(value)
-        for index, item in enumerate(value.tolist() if isinstance(value, np.ndarray) else value):
-            yield from _leaves(f"{path}[{index}]", item)
-    else:
-        yield path, value
+    return values

@@ -13,9 +13,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from demorec.core.plain import parse_json
 from demorec.mcap.container import Container
-from demorec.mcap.messages import Value, message_fields
+from demorec.mcap.messages import message_fields
 from demorec.mcap.metadata import EPISODE
 
 _SEAL = "crc32"
@@ -25,6 +27,7 @@ _MADE_BY = ("info.versions", "info.simulation.cpu")
 
 _SHOWN = reprlib.Repr(maxstring=80, maxother=80)
 
+Value = bool | int | float | str | bytes
 Differing = tuple[str, int | None, Value | None, Value | None]
 """A difference in a stream: field, frame if any, recorded value, remade value."""
 
@@ -172,11 +175,11 @@ def _message_differences(topic: str, recorded: Contents, again: Contents, fps: i
             if a == b:
                 continue
             try:
-                a_fields = message_fields(schema, a)
+                a_fields = dict(_nested("", message_fields(schema, a)))
             except (ValueError, KeyError) as error:
                 yield "message", frame, f"{len(a)} bytes that are not a message ({error})", b
                 continue
-            differing = list(_differing(a_fields, message_fields(schema, b)))
+            differing = list(_differing(a_fields, dict(_nested("", message_fields(schema, b)))))
             for name, ours_now, theirs_now in differing or [("padding", a, b)]:
                 yield name, frame, ours_now, theirs_now
 
@@ -194,6 +197,8 @@ def _leaves(values: Mapping[str, str]) -> Iterator[tuple[str, Value]]:
 
 
 def _nested(path: str, value: Any) -> Iterator[tuple[str, Value]]:
+    if isinstance(value, np.ndarray):
+        value = value.tobytes() if value.dtype == np.uint8 else value.tolist()
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else None
     if items is None:
         yield path, "null" if value is None else value
@@ -201,4 +206,4 @@ def _nested(path: str, value: Any) -> Iterator[tuple[str, Value]]:
     if not value:
         yield path, f"an empty {'object' if isinstance(value, dict) else 'list'}"
     for key, child in items:
-        yield from _nested(f"{path}.{key}" if isinstance(key, str) else f"{path}[{key}]", child)
+        yield from _nested(f"{path}.{key}".lstrip(".") if isinstance(key, str) else f"{path}[{key}]", child)
