@@ -203,7 +203,7 @@ def read_label_info(data: bytes) -> dict[int, str]:
 
 
 def message_fields(schema: str, data: bytes) -> dict[str, Any]:
-    """Decode a recording's message to its fields, in order; ValueError unless it is of this type, which recordings use."""
+    """Decode a message to its fields, in order; ValueError unless it is of this type, which recordings use."""
     if schema == PROTOBUF_VIDEO:
         return dict(protobuf_fields(data))
     if schema not in DEFINITIONS:

@@ -57,7 +57,7 @@ class Painter:
     ) -> None:
         self._renderer = renderer
         self._true_from_recorded = true_from_recorded or {}
-        self._world: Drawable | None = None
+        self._world: Drawable
         self._setup = RenderSetup(
             bodies=(),
             cameras=cameras,
@@ -77,13 +77,7 @@ class Painter:
         self._renderer.setup(replace(self._setup, bodies=bodies, mounts=mounts, light=light))
 
     def images(self) -> dict[str, CameraImages]:
-        """Draw the world's current state: camera name -> images, with the recorded poses of the cameras.
-
-        Raises:
-            RuntimeError: `setup` was not called.
-        """
-        if self._world is None:
-            raise RuntimeError("the painter has no world: call setup first")
+        """Draw the state of the world of `setup`: camera name -> images, with the recorded poses of the cameras."""
         images = self._renderer.render(self._world.poses())
         for name, error in self._true_from_recorded.items():
             images[name] = replace(images[name], world_from_camera=images[name].world_from_camera @ error)
