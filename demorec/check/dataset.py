@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.check.base import Checkable, Fault, NotApplicableError, check, listed
 from demorec.check.run import CheckedRun
@@ -23,81 +20,18 @@ from demorec.datasets.lerobot.inspect import content_digest, noted, recorded_inf
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import is_dataset
 from demorec.datasets.lerobot.prepare import reasons_to_transcode, recorded_videos
+from demorec.datasets.lerobot.rows import DataRows
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord
-from demorec.episode.info import EpisodeInfo
 from demorec.mcap import open_simulated
 from demorec.runs.run_file import DATASET, EPISODES, FAILED
 
-Rows = Mapping[str, NDArray[Any]]
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 """Sidecar keys that do not come from the recording."""
 _DECIDING_OPTIONS = ("action", "state", "privileged", "features", "include_failures", "fps", "depth")
 """Export options that decide the content of the episodes."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DescribedEpisode:
-    """A simulated episode of a dataset, with its row of the sidecar, `kept`."""
-
-    number: int
-    rows: Rows  # feature -> (T, D)
-    kept: dict[str, Any]
-    info: EpisodeInfo
-
-
-class CheckedDataset(LeRobotFolder):
-    """An open dataset with its rows and its sidecar in memory."""
-
-    @property
-    def numbers(self) -> Mapping[int, Rows]:
-        """Episode number -> feature -> (T, D), for the episodes with readable rows."""
-        return self._rows_and_errors[0]
-
-    @property
-    def unreadable(self) -> Mapping[int, str]:
-        """Episode number -> reason why its rows cannot be read."""
-        return self._rows_and_errors[1]
-
-    @cached_property
-    def _rows_and_errors(self) -> tuple[dict[int, Rows], dict[int, str]]:
-        reader = self.rows(self.columns)
-        rows: dict[int, Rows] = {}
-        errors: dict[int, str] = {}
-        for number, place in enumerate(self.listed):
-            problems: list[str] = []
-            with noted(problems, self.root):
-                rows[number] = usable_numbers(self, reader, place)
-            if problems:
-                errors[number] = problems[0]
-        return rows, errors
-
-    @cached_property
-    def records(self) -> list[dict[str, Any]]:
-        """The sidecar's rows for the episodes; empty for a dataset of another writer."""
-        return episode_records(self)
-
-    def check_simulated(self) -> None:
-        """Raise ConfigError for a dataset of external episodes, which cannot be simulated or replayed."""
-        if any(row["episode_info"] is None for row in self.records):
-            raise ConfigError(
-                f"The episodes of this dataset were recorded by another robot or program and have no scene: {self.root}"
-            )
-
-    def described(self) -> list[DescribedEpisode]:
-        """Simulated episodes that the sidecar describes, in order; LeRobot's `resume` adds episodes without a
-        description.
-        """
-        found = []
-        for row in self.records:
-            number = row["episode_index"]
-            if row["episode_info"] is None or number not in self.numbers:
-                continue
-            info = recorded_info(row, self.root)
-            found.append(DescribedEpisode(number=number, rows=self.numbers[number], kept=row, info=info))
-        return sorted(found, key=lambda episode: episode.number)
-
-
-def episode_records(dataset: LeRobotFolder) -> list[dict[str, Any]]:
+def _episode_records(dataset: LeRobotFolder) -> list[dict[str, Any]]:
     """Read the sidecar's rows for the episodes; empty for a dataset of another writer."""
     return dataset.sidecar([name for name in EPISODE_SCHEMA.names if name != "episode_index"])
 
@@ -113,7 +47,7 @@ def episode_records(dataset: LeRobotFolder) -> list[dict[str, Any]]:
 def dataset_sidecar(subject: Checkable) -> Iterator[Fault]:
     """Compare instruction and content digest of each episode, as far as its files can be read, with the sidecar."""
     dataset = LeRobotFolder(subject.path)
-    records = episode_records(dataset)
+    records = _episode_records(dataset)
     if not records:
         raise NotApplicableError("another program wrote the dataset")
     count = len(dataset.listed)
@@ -147,21 +81,23 @@ def run_dataset(run: CheckedRun) -> Iterator[Fault]:
     path = run.path / DATASET
     if not is_dataset(path):
         raise NotApplicableError("the run has no dataset")
-    dataset = CheckedDataset(path)
-    if not dataset.records or any(row["source"] is None for row in dataset.records):
+    dataset = LeRobotFolder(path)
+    records = _episode_records(dataset)
+    if not records or any(row["source"] is None for row in records):
         return listed(["the dataset does not name its source recordings"])
-    dataset.check_simulated()
-    options = _export_options(path)
-    wrong = list(dict.fromkeys(dataset.unreadable.values()))
+    options, reader = _export_options(path), dataset.rows(dataset.columns)
+    wrong = []
     successes = len(run.run.successes)
-    found = sum(bool(row["success"]) for row in dataset.records)
+    found = sum(bool(row["success"]) for row in records)
     if found != successes:
         wrong.append(f"it has {found} successes, the run {successes}")
-    for episode in dataset.described():
-        folder = run.path / (EPISODES if episode.kept["success"] else FAILED)
-        file = folder / Path(str(episode.kept["source"])).name
-        if words := ", ".join(_episode_differences(file, options, episode, dataset)):
-            wrong.append(f"episode {episode.number}: {words}")
+    for row in records:
+        file = run.path / (EPISODES if row["success"] else FAILED) / Path(str(row["source"])).name
+        problems: list[str] = []
+        with noted(problems, path):
+            problems += _episode_differences(file, options, row, dataset, reader)
+        if problems:
+            wrong.append(f"episode {row['episode_index']}: {', '.join(problems)}")
     return listed(wrong)
 
 
@@ -183,14 +119,23 @@ def _export_options(dataset: Path) -> ExportOptions:
 
 
 def _episode_differences(
-    recording_file: Path, options: ExportOptions, episode: DescribedEpisode, dataset: CheckedDataset
+    recording_file: Path, options: ExportOptions, kept: Mapping[str, Any], dataset: LeRobotFolder, reader: DataRows
 ) -> Iterator[str]:
     """Yield the features in which an episode differs from its recording exported with the same options.
 
+    Args:
+        recording_file: The recording.
+        options: Options of the export.
+        kept: The episode's row of the sidecar.
+        dataset: The dataset.
+        reader: All columns of its tables.
+
     Raises:
-        ExportError: A video of the dataset cannot be read.
+        ExportError: The rows or a video of the episode cannot be read.
         ResourceError: This machine cannot read it.
     """
+    place = dataset.listed[kept["episode_index"]]
+    rows = usable_numbers(dataset, reader, place)
     try:
         with open_simulated(recording_file) as recording:
             expected = ExportEpisode(recording, options)
@@ -206,11 +151,10 @@ def _episode_differences(
             raise lack from error
         yield f"its recording cannot be exported as this episode ({describe_error(error)})"
         return
-    place = dataset.listed[episode.number]
     if place.tasks != (expected.info.instruction,):
         yield "instruction"
     for name, values in columns.items():
-        found = episode.rows.get(name)
+        found = rows.get(name)
         if found is None or not np.array_equal(found, values.reshape(len(values), -1)):
             yield name
     videos = video_digests(dataset, place)
@@ -218,5 +162,5 @@ def _episode_differences(
         if videos.get(key) != video.digest:
             yield key
     for name, value in record.row.items():
-        if name not in _OF_THE_PLACE and episode.kept.get(name) != value:
+        if name not in _OF_THE_PLACE and kept.get(name) != value:
             yield f"sidecar's {name}"

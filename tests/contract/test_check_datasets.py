@@ -26,7 +26,6 @@ from support.export import rewrite_video
 from support.external import make_external, write_external
 from support.mcap import rewritten
 
-from demorec.check.dataset import CheckedDataset
 from demorec.core.errors import ExportError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
@@ -249,7 +248,6 @@ def test_episodes_that_the_sidecar_does_not_know(run: Path, tmp_path: Path) -> N
     spoilt = shutil.copytree(run, tmp_path / "run")
     path = next((spoilt / "dataset/demorec/episodes").glob("*/*.parquet"))
     pq.write_table(pq.read_table(path).slice(1), path)
-    assert [episode.number for episode in CheckedDataset(spoilt / "dataset").described()] == [1, 2]
     (result,) = checked(spoilt / "dataset", "dataset", only=["dataset_sidecar"]).results
     assert (result.verdict, result.findings[0].message) == (
         "broken",
