@@ -8,21 +8,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.annotate import BoxEntry
 from demorec.episode.words import nouns_of
 from demorec.mcap import Recording
 
 
-def seen_objects(recording: Recording, rows: NDArray[np.intp], camera: str) -> Iterator[BoxEntry]:
-    """Yield every object that a camera with segmentation sees in the given frames, row by row."""
-    row_of = {int(frame): row for row, frame in enumerate(rows.tolist())}
+def seen_objects(recording: Recording, camera: str) -> Iterator[BoxEntry]:
+    """Yield every object that a camera with segmentation sees, frame by frame."""
     bodies = {body.name: body for body in recording.info.simulated.scene.bodies}
     named = [(value, bodies[name]) for value, name in recording.segment_names().items() if name in bodies]
     objects = [(value, body) for value, body in named if body.role in ("object", "target", "distractor")]
     for frame, image in enumerate(recording.segmentation(camera)):
-        for value, body in objects if frame in row_of else ():
+        for value, body in objects:
             y, x = np.nonzero(image == value)
             if not len(x):
                 continue
@@ -34,4 +32,4 @@ def seen_objects(recording: Recording, rows: NDArray[np.intp], camera: str) -> I
                 "object": body.name,
                 "color": body.color_name,
             }
-            yield row_of[frame], nouns_of(body)[0], values
+            yield frame, nouns_of(body)[0], values

@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from itertools import pairwise
 
-import numpy as np
-from numpy.typing import NDArray
-
 from demorec.annotate import KINDS, LanguageKind, Statement
 from demorec.annotate.referring import joined, phrase_for, place_of, prepositions, situation
 from demorec.annotate.timeline import PhaseSegment, episode_timeline
@@ -52,14 +49,12 @@ _GoalWords = dict[str, str]
 Its prepositions are "into" ("into", "onto" or "to") and "inside" ("in", "on" or "at")."""
 
 
-def episode_statements(
-    recording: Recording, rows: NDArray[np.intp], kinds: Collection[LanguageKind]
-) -> list[Statement]:
+def episode_statements(recording: Recording, kinds: Collection[LanguageKind]) -> list[Statement]:
     """Return the statements of the requested kinds in row order; within a row, in the order of `KINDS`.
 
-    `rows` is the (T,) recorded frame of each dataset row. Raises RecordingError if the recording is damaged.
+    Raises RecordingError if the recording is damaged.
     """
-    narrator = _Narrator(recording, rows)
+    narrator = _Narrator(recording)
     sentences = {
         "subtask": narrator.subtasks,
         "plan": narrator.plans,
@@ -74,8 +69,9 @@ def episode_statements(
 class _Narrator:
     """The sentences of one episode, kind by kind, each with its row."""
 
-    def __init__(self, recording: Recording, rows: NDArray[np.intp]) -> None:
-        self._info, self._trajectory, self._rows = recording.info, recording.trajectory(), rows
+    def __init__(self, recording: Recording) -> None:
+        self._info, self._trajectory = recording.info, recording.trajectory()
+        self._num_frames = recording.num_frames
         self._scene = recording.info.simulated.scene
         self._timeline = episode_timeline(recording)
         self._is_dropped = self._timeline.is_dropped
@@ -94,20 +90,9 @@ class _Narrator:
         place = phrase_for(name, now) if name else "its place"
         return {"object": phrase_for(goal.object, now), "place": place, "into": into, "inside": inside}
 
-    def _row_of(self, frame: int) -> int:
-        """Return the first row at or after a frame; T if all are earlier."""
-        return int(np.searchsorted(self._rows, frame))
-
-    def _segment_rows(self) -> Iterator[tuple[PhaseSegment, int, int]]:
-        """Yield (segment, first row, row after the last) of each segment that contains a row."""
-        for segment in self._timeline.segments:
-            first, end = self._row_of(segment.first), self._row_of(segment.end)
-            if first < end:
-                yield segment, first, end
-
     def subtasks(self) -> Iterator[tuple[int, str]]:
-        for segment, first, _ in self._segment_rows():
-            yield first, self._subtask(segment)
+        for segment in self._timeline.segments:
+            yield segment.first, self._subtask(segment)
 
     def _subtask(self, segment: PhaseSegment) -> str:
         """Return the imperative for a segment; the instruction if the recording has no phases."""
@@ -129,9 +114,9 @@ class _Narrator:
     def plans(self) -> Iterator[tuple[int, str]]:
         """Yield numbered lists of the remaining actions, at the start and at each repeated attempt."""
         for index, attempt in enumerate(self._timeline.attempts):
-            row = 0 if index == 0 else self._row_of(attempt.first)
+            row = 0 if index == 0 else attempt.first
             is_new_goal = index > 0 and attempt.number == 0
-            if attempt.goal is None or is_new_goal or row >= len(self._rows):
+            if attempt.goal is None or is_new_goal:
                 continue
             actions: list[str] = []
             for goal in range(attempt.goal, len(self._scene.goals)):
@@ -145,18 +130,16 @@ class _Narrator:
             yield row, "\n".join(f"{number}. {action}" for number, action in enumerate(actions, start=1))
 
     def memories(self) -> Iterator[tuple[int, str]]:
-        """Yield the actions done so far, in the first person; if two segments begin in one row, the later applies."""
+        """Yield the actions done so far, in the first person."""
         done: list[str] = []
-        latest: dict[int, str] = {}
         for before, segment in pairwise(self._timeline.segments):
             if before.attempt is not segment.attempt:
                 continue
             deed = self._deed(before, segment)
-            if deed and (row := self._row_of(segment.first)) < len(self._rows):
-                latest[row] = " ".join([*done, deed])
+            if deed:
+                yield segment.first, " ".join([*done, deed])
             if before.phase == "release" and segment.attempt.end == "placed":
                 done.append(deed)
-        yield from latest.items()
 
     def _deed(self, before: PhaseSegment, segment: PhaseSegment) -> str:
         """Return the deed done when one segment of an attempt follows another; "" for none."""
@@ -176,10 +159,10 @@ class _Narrator:
         return ""
 
     def motions(self) -> Iterator[tuple[int, str]]:
-        trajectory, last = self._trajectory, self._rows[-1]
-        for _, first, end in self._segment_rows():
-            frames = [self._rows[first], self._rows[end] if end < len(self._rows) else last]
-            yield first, _motion(trajectory.base_from_tcp[frames, :3], trajectory.gripper_width[frames])
+        trajectory = self._trajectory
+        for segment in self._timeline.segments:
+            frames = [segment.first, min(segment.end, self._num_frames - 1)]
+            yield segment.first, _motion(trajectory.base_from_tcp[frames, :3], trajectory.gripper_width[frames])
 
     def wordings(self) -> Iterator[tuple[int, str]]:
         info = self._info

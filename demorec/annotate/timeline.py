@@ -14,7 +14,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Trajectory, consecutive_runs
@@ -154,15 +153,16 @@ def dense_stages(num_goals: int, runs: Sequence[StageRun]) -> tuple[str, ...]:
     return tuple(f"goal {goal}: {stage}" for goal in range(1, num_goals + 1) for stage in stages)
 
 
-def dense_runs(timeline: EpisodeTimeline, rows: NDArray[np.intp]) -> list[StageRun]:
-    """Return the stages of an episode's rows ((T,) recorded frames), in order of time; a single stage if the phases are
-    not those of demorec's skills.
+def dense_runs(timeline: EpisodeTimeline) -> list[StageRun]:
+    """Return the stages of an episode, in order of time; a single stage if the phases are not those of demorec's
+    skills.
     """
     names = [_stage_name(segment) for segment in timeline.segments]
     if not all(names):
-        return [StageRun(WHOLE_TASK, 0, len(rows) - 1)]
-    starts = [segment.first for segment in timeline.segments]
-    stages = [names[number] for number in (np.searchsorted(starts, rows, side="right") - 1).tolist()]
+        return [StageRun(WHOLE_TASK, 0, timeline.segments[-1].end - 1)]
+    stages: list[str] = []
+    for segment, name in zip(timeline.segments, names, strict=True):
+        stages += [name] * (segment.end - segment.first)
     return [StageRun(name, first, end - 1) for name, first, end in consecutive_runs(stages)]
 
 

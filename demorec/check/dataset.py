@@ -27,7 +27,7 @@ from demorec.runs.run_file import DATASET, EPISODES, FAILED
 
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 """Sidecar keys that do not come from the recording."""
-_DECIDING_OPTIONS = ("action", "state", "privileged", "features", "include_failures", "fps", "depth")
+_DECIDING_OPTIONS = ("action", "state", "privileged", "features", "include_failures", "depth")
 """Export options that decide the content of the episodes."""
 
 

@@ -29,7 +29,6 @@ class Export:
       demorec export lerobot recordings/cubes --out cubes --repo-id me/cubes
       demorec export lerobot run_a run_b --out both --action joint_increment
       demorec export lerobot recordings/cubes --out cubes --append --episodes 100:
-      demorec export lerobot recordings/cubes --out slow --fps 10
       demorec export hdf5 recordings/cubes --out cubes.hdf5 --action ee_delta
     """
 

@@ -71,8 +71,6 @@ class ExportEpisode[O: CommonOptions]:
 
     Attributes:
         scene: World at the start; None if unknown.
-        fps: Frames per second of the dataset.
-        stride: Number of recorded frames per exported frame.
         state: Form of `observation.state`.
         names: Vector feature of the dataset -> names of its elements.
         scalars: Features of `SCALARS` in the dataset.
@@ -93,9 +91,7 @@ class ExportEpisode[O: CommonOptions]:
         self.scene = scene_of(self.info)
         self.state: StateKind = getattr(options, "state", "joint")  # an option of LeRobot datasets only
         if self.scene is None:
-            _refuse_without_scene(self.info, options, recording)
-        self.stride = _frame_stride(self.info.fps, options.fps)
-        self.fps = self.info.fps // self.stride
+            _refuse_without_scene(options, recording)
         names, cameras, scalars = self._offered_names(), self._offered_cameras(), self._offered_scalars()
         offered = [*names, *(camera.feature for camera in cameras), *scalars]
         _check_feature_names(options, dict.fromkeys([*offered, *(feature.name for feature in self.info.features)]))
@@ -139,6 +135,11 @@ class ExportEpisode[O: CommonOptions]:
         return cameras + [ExportCamera(name=name, feature=IMAGE_PREFIX + name, is_depth=True) for name in only_depth]
 
     @property
+    def num_frames(self) -> int:
+        """T."""
+        return self.recording.num_frames
+
+    @property
     def urdf(self) -> str:
         """The robot's URDF as text; "" if unknown."""
         return self.info.urdf or self.recording.description()
@@ -166,36 +167,22 @@ class ExportEpisode[O: CommonOptions]:
 
     @cached_property
     def table(self) -> Table:
-        """Features of every frame of the recording."""
+        """Features of every frame of the recording. Raises ExportError if it has none."""
+        if self.num_frames == 0:
+            raise ExportError(f"The recording has no frames: {self.recording.path}")
         return self._read_table()
 
     @cached_property
-    def rows(self) -> NDArray[np.intp]:
-        """(T,) indices of the exported frames in the recording. Raises ExportError if there are none."""
-        if self.recording.num_frames == 0:
-            raise ExportError(f"The recording has no frames: {self.recording.path}")
-        return np.arange(0, self.recording.num_frames, self.stride)
-
-    @cached_property
     def vectors(self) -> Mapping[str, NDArray[np.floating[Any]]]:
-        """Feature of `names` -> (T, D), in the recording's precision. If frames are left out, an observation is from
-        the first frame of its group and an action from the last: the target at the time of the next observation. Raises
-        ExportError if the recording has no frames, or a number that is not finite, and RecordingError if it is damaged.
+        """Feature of `names` -> (T, D), in the recording's precision. Raises ExportError if the recording has no
+        frames, or a number that is not finite, and RecordingError if it is damaged.
         """
-        last_of_group = np.minimum(self.rows + self.stride - 1, self.recording.num_frames - 1)
-        frames = dict.fromkeys(self.names, self.rows) | dict.fromkeys((ACTION, COMMAND), last_of_group)
-        found = self.table.features
-        vectors = {name: found[name][frames[name]] for name in self.names if name in found}
+        vectors = {name: values for name, values in self.table.features.items() if name in self.names}
         if self.options.privileged or self.state != "joint":
             vectors |= self._scene_observations()
         if self.options.action != "joint":
-            vectors[ACTION] = action_vectors(
-                self.recording.trajectory(),
-                self.info.simulated.scene,
-                self.options.action,
-                frames[ACTION],
-                dtype=np.float64,
-            )
+            scene = self.info.simulated.scene
+            vectors[ACTION] = action_vectors(self.recording.trajectory(), scene, self.options.action, dtype=np.float64)
         for name, values in vectors.items():
             self._check_finite(name, values)
         return vectors
@@ -210,7 +197,7 @@ class ExportEpisode[O: CommonOptions]:
             dtype=np.float64,
         )
         taken = [name for name in (STATE, ENVIRONMENT_STATE) if name in vectors and name in self.names]
-        return {name: vectors[name][self.rows] for name in taken}
+        return {name: vectors[name] for name in taken}
 
     @cached_property
     def columns(self) -> Mapping[str, NDArray[np.generic]]:
@@ -226,21 +213,20 @@ class ExportEpisode[O: CommonOptions]:
 
     def _scalar(self, name: str) -> NDArray[np.generic]:
         if name == INTERVENTION:
-            return interventions(self.recording.phases)[self.rows]
+            return interventions(self.recording.phases)
         values = self.is_last if name == DONE else self.is_last & bool(self.recording.success)
         return values.astype(SCALARS[name])
 
     @property
     def is_last(self) -> NDArray[np.bool_]:
         """(T,) whether each frame is the last one."""
-        return np.asarray(self.rows == self.rows[-1])
+        return np.asarray(np.arange(self.num_frames) == self.num_frames - 1)
 
     def _check_finite(self, name: str, values: NDArray[np.floating[Any]]) -> None:
         if len(wrong := np.flatnonzero(~np.isfinite(values).all(axis=1))):
             why = "too large for float32" if values.dtype == np.float32 else "not finite"
             raise ExportError(
-                f"The feature {name} is {why} in frame {int(self.rows[wrong[0]])}, leave the recording out: "
-                f"{self.recording.path}"
+                f"The feature {name} is {why} in frame {wrong[0]}, leave the recording out: {self.recording.path}"
             )
 
     def numbers(self, camera: ExportCamera) -> NDArray[np.int64]:
@@ -254,7 +240,7 @@ class ExportEpisode[O: CommonOptions]:
                 f"Frame {without[0]} has no image of the camera {camera.name}, like {len(without)} of {len(numbers)} "
                 f"frames: leave the camera (--features) or the episode (--episodes) out: {self.recording.path}"
             )
-        return numbers[self.rows]
+        return numbers
 
     def images(self, camera: ExportCamera) -> Iterator[NDArray[Any]]:
         """Yield one image per frame: (H, W, 3) uint8 RGB, or (H, W) float32 metres for a depth camera. Raises
@@ -274,11 +260,10 @@ class ExportEpisode[O: CommonOptions]:
             yield image
 
 
-def _refuse_without_scene(info: EpisodeInfo, options: CommonOptions, recording: Recording) -> None:
+def _refuse_without_scene(options: CommonOptions, recording: Recording) -> None:
     """Raise ConfigError for options that only an episode with a known scene can serve."""
     state = getattr(options, "state", "joint")
     named = {f"action {options.action}": options.action != "joint", f"state {state}": state != "joint"}
-    named |= {f"fps {options.fps}": options.fps not in (None, info.fps)}
     named |= {f"language {kind}": kind != "subtask" for kind in getattr(options, "language", None) or ()}
     # all but the first exist only for LeRobot datasets
     named |= {name: getattr(options, name, False) for name in ("privileged", "intervention", "progress", "boxes")}
@@ -286,17 +271,6 @@ def _refuse_without_scene(info: EpisodeInfo, options: CommonOptions, recording: 
         raise ConfigError(
             f"{', '.join(needs_scene)} needs the scene of a simulated episode, leave it out: {recording.path}"
         )
-
-
-def _frame_stride(recording_fps: int, fps: int | None) -> int:
-    if fps is None:
-        return 1
-    if recording_fps % fps:
-        divisors = [str(n) for n in range(1, recording_fps + 1) if recording_fps % n == 0]
-        raise ConfigError(
-            f"fps is {fps}, which does not divide the recordings' {recording_fps}: allowed are {', '.join(divisors)}."
-        )
-    return recording_fps // fps
 
 
 def _check_feature_names(options: CommonOptions, offered: Collection[str]) -> None:

@@ -41,8 +41,6 @@ class CommonOptions:
     """
     depth: Rare[bool] = False
     """Add depth images if the recordings have them."""
-    fps: int | None = None
-    """Frames per second of the dataset; must divide the recordings' rate; frames in between are left out."""
     overwrite: bool = False
     """Replace an existing dataset; a folder with any other content is never replaced."""
 
@@ -53,8 +51,6 @@ class CommonOptions:
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""
         parse_episodes(self.episodes)
-        if self.fps is not None and self.fps < 1:
-            raise OptionError("fps", f"is {self.fps}, allowed are 1 or more.")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -265,7 +265,6 @@ def action_vectors(
     trajectory: Trajectory,
     scene: Scene,
     kind: ActionKind,
-    rows: NDArray[np.intp] | slice = slice(None),
     *,
     dtype: VectorType = np.float32,
 ) -> Vectors:
@@ -281,23 +280,21 @@ def action_vectors(
     - `ee_delta`: change of that pose since the previous frame, the first since the TCP pose observed at frame 0:
     translation in base axes (m), then rotation vector in base axes (rad, |r| <= pi), applied from the left
     (`pose_from_delta`); noise is removed as in `joint_increment`, with rotation vectors added.
-
-    `rows` are the frames of the whole episode to return; increments are taken between these.
     """
-    gripper = trajectory.action_gripper[rows]
+    gripper = trajectory.action_gripper
     if kind == "joint":
-        return _joined([trajectory.action_joint_target[rows], gripper], dtype)
+        return _joined([trajectory.action_joint_target, gripper], dtype)
     if kind == "joint_increment":
-        targets, commands = trajectory.action_joint_target[rows], trajectory.command_joint_target[rows]
+        targets, commands = trajectory.action_joint_target, trajectory.command_joint_target
         increments = targets - np.concatenate([np.array([scene.robot.joint_position]), targets[:-1]])
-        increments[1:] += _noise_share(trajectory.time_ns[rows]) * (targets[:-1] - commands[:-1])
+        increments[1:] += _noise_share(trajectory.time_ns) * (targets[:-1] - commands[:-1])
         return _joined([increments, gripper], dtype)
-    poses, executed = trajectory.action_base_from_tcp[rows], trajectory.command_base_from_tcp[rows]
+    poses, executed = trajectory.action_base_from_tcp, trajectory.command_base_from_tcp
     if kind == "ee":
         return _joined([_continuous(poses), gripper], dtype)
     before = np.concatenate([trajectory.base_from_tcp[:1], poses[:-1]])
     shifts, turns = poses[:, :3] - before[:, :3], _rotation_vectors(before[:, 3:], poses[:, 3:])
-    share = _noise_share(trajectory.time_ns[rows])
+    share = _noise_share(trajectory.time_ns)
     shifts[1:] += share * (poses[:-1, :3] - executed[:-1, :3])
     turns[1:] += share * _rotation_vectors(executed[:-1, 3:], poses[:-1, 3:])
     return _joined([shifts, turns, gripper], dtype)

@@ -120,7 +120,7 @@ def test_an_upload_is_private_and_tagged(
 
 @pytest.mark.slow
 def test_verification_passes_a_good_dataset_and_drops_a_bad_one(run: Path, tmp_path: Path) -> None:
-    report = export_lerobot([run], tmp_path / "good", ExportOptions(privileged=True, fps=15))
+    report = export_lerobot([run], tmp_path / "good", ExportOptions(privileged=True))
     assert report.verified_frames == 4
     # The recordings change after they were read, so the dataset no longer matches them.
     changing = tmp_path / "run"

@@ -208,17 +208,6 @@ def test_memories_follow_completed_actions(runs: list[Path], dataset: Path) -> N
             assert len(re.findall(r"I put the", memories[-1]["content"])) == len(goals)
 
 
-def test_fewer_frames_begin_a_subtask_at_the_first_frame_that_is_left(runs: list[Path], tmp_path: Path) -> None:
-    export(runs[0], tmp_path / "slow", language=("subtask",), fps=10)
-    with _recording(runs[0]) as recording:
-        phase = recording.phases[::3]
-    (frames,) = language_of(tmp_path / "slow")
-    rows = frames[0][0]
-    assert {row["style"] for row in rows} == {"subtask"}
-    starts = [0, *(frame for frame in range(1, len(phase)) if phase[frame] != phase[frame - 1])]
-    assert [row["timestamp"] for row in rows] == [float(np.float32(start / 10)) for start in starts]
-
-
 def test_the_same_seed_gives_the_same_language_and_changes_nothing_else(runs: list[Path], tmp_path: Path) -> None:
     few = [runs[TASKS.names().index(task)] for task in ("pick_place", "sort_by_color")]
     for name in ("once", "again"):
@@ -260,7 +249,7 @@ def stages_of(run: Path) -> tuple[int, list[StageRun]]:
     """Number of goals and stages of the run's only episode."""
     with _recording(run) as recording:
         num_goals = len(recording.info.simulated.scene.goals)
-        return num_goals, dense_runs(episode_timeline(recording), np.arange(recording.num_frames))
+        return num_goals, dense_runs(episode_timeline(recording))
 
 
 def test_progress_is_lerobots_own_over_the_true_stages(runs: list[Path], dataset: Path) -> None:

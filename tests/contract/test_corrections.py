@@ -119,8 +119,6 @@ def test_the_dataset_marks_the_experts_frames(rollout: tuple[Attempt, Path], tmp
     column = data_table(tmp_path / "dataset").column("intervention").to_pylist()
     assert column == acted
     assert set(column) == {False, True}
-    export(rollout[1], tmp_path / "slow", intervention=True, fps=15)
-    assert data_table(tmp_path / "slow").column("intervention").to_pylist() == acted[::2]
 
 
 @pytest.mark.parametrize("exporter", EXPORTERS.names())

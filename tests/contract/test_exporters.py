@@ -126,8 +126,6 @@ def test_other_files_are_never_replaced(exporter: str, run: Path, tmp_path: Path
     [
         ({"episodes": "7"}, ConfigError, "Nothing to export"),
         ({"episodes": "x"}, ConfigError, "0:100"),
-        ({"fps": 7}, ConfigError, "does not divide.*1, 2, 3, 5, 6, 10, 15, 30"),
-        ({"fps": 0}, ConfigError, "allowed are 1 or more"),
         ({"features": ("observation.stat",)}, ConfigError, "Did you mean 'observation.state'"),
         ({"features": ("front",)}, ConfigError, "observation.images.front, observation.images.wrist"),
         ({"features": ("observation.environment_state",)}, ConfigError, "only --privileged adds it"),

@@ -102,7 +102,6 @@ def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) 
         ({"privileged": True}, "privileged needs the scene"),
         ({"intervention": True}, "intervention needs the scene"),
         ({"depth": True}, "depth needs recordings"),
-        ({"fps": 10}, "fps 10 needs the scene"),
         ({"features": ("observation.forse",)}, "Unknown feature 'observation.forse'.*observation.force"),
     ],
 )

@@ -72,16 +72,6 @@ def test_images_are_the_decoded_ones(run: Path, tmp_path: Path) -> None:
                     assert (distances.chunks, distances.dtype) == ((1, 48, 64, 1), np.float32)
 
 
-def test_fewer_frames(run: Path, tmp_path: Path) -> None:
-    """Observations of frames 0 and 3, actions of frames 2 and 4: the last of each group, and of the episode."""
-    export(run, tmp_path / "d.hdf5", "hdf5", fps=10, episodes="2")
-    with h5py.File(tmp_path / "d.hdf5") as file, recording(run, 2) as source:
-        demo, trajectory = file["data/demo_0"], source.trajectory()
-        np.testing.assert_array_equal(demo["states"][:, :9], trajectory.joint_position[[0, 3]])
-        np.testing.assert_array_equal(demo["actions"][:, :7], trajectory.action_joint_target[[2, 4]])
-        np.testing.assert_array_equal(demo["obs/front_image"][1], source.image("front", 3))
-
-
 @pytest.mark.parametrize(("share", "valid"), [(0.0, []), (0.1, []), (0.5, ["demo_1"]), (0.7, ["demo_1", "demo_2"])])
 def test_masks_divide_the_episodes(run: Path, tmp_path: Path, share: float, valid: list[str]) -> None:
     export(run, tmp_path / "d.hdf5", "hdf5", valid_share=share)

@@ -163,30 +163,30 @@ def columns_of(rng: np.random.Generator, count: int) -> Trajectory:
 def test_increments_follow_the_decay_of_the_noise(fps: int) -> None:
     """Where the executed command returns to the clean one, increments are those of the executed one."""
     rng = np.random.default_rng(11)
-    count, step = 12, 30 // fps
-    columns = columns_of(rng, count * step)
-    time = np.arange(count * step)
-    noise = 0.7 ** time[:, None] * rng.normal(0, 0.02, 7)
-    shift = 0.7 ** time[:, None] * rng.normal(0, 0.01, 3)
+    time = np.arange(12)
+    columns = columns_of(rng, len(time))
+    decay = 0.7 ** (time * 30 / fps)
+    noise = decay[:, None] * rng.normal(0, 0.02, 7)
+    shift = decay[:, None] * rng.normal(0, 0.01, 3)
     poses = columns.action_base_from_tcp
     # Turned about the vertical by a decaying angle, from the left.
-    turn = Rotation.from_rotvec(np.outer(0.7**time * 0.05, [0.0, 0.0, 1.0]))
+    turn = Rotation.from_rotvec(np.outer(decay * 0.05, [0.0, 0.0, 1.0]))
     still = Rotation.from_quat(np.broadcast_to(poses[0, 3:], (len(time), 4)))
     clean = np.concatenate([poses[:, :3], still.as_quat()], axis=1)
     executed = np.concatenate([poses[:, :3] + shift, (turn * still).as_quat()], axis=1)
     columns = replace(
         columns,
-        time_ns=frame_times(time, 30),
+        time_ns=frame_times(time, fps),
         command_joint_target=columns.action_joint_target + noise,
         action_base_from_tcp=clean,
         command_base_from_tcp=executed,
     )
-    rows, scene = time[::step], make_scene(rng)
-    joints = action_vectors(columns, scene, "joint_increment", rows)[1:, :7]
-    assert np.allclose(joints, np.diff(columns.command_joint_target[rows], axis=0), atol=1e-6)
-    deltas = action_vectors(columns, scene, "ee_delta", rows)[1:]
-    assert np.allclose(deltas[:, :3], np.diff(executed[rows, :3], axis=0), atol=1e-6)
-    turns = (turn[rows[1:]] * turn[rows[:-1]].inv()).as_rotvec()
+    scene = make_scene(rng)
+    joints = action_vectors(columns, scene, "joint_increment")[1:, :7]
+    assert np.allclose(joints, np.diff(columns.command_joint_target, axis=0), atol=1e-6)
+    deltas = action_vectors(columns, scene, "ee_delta")[1:]
+    assert np.allclose(deltas[:, :3], np.diff(executed[:, :3], axis=0), atol=1e-6)
+    turns = (turn[1:] * turn[:-1].inv()).as_rotvec()
     assert np.allclose(deltas[:, 3:6], turns, atol=1e-6)
 
 

@@ -86,10 +86,9 @@ def told(folder: Path, script: list[tuple[str, str, str]], **arguments: object) 
             writer.write(replace(frame, phase=phase, events=events, is_deliberate_miss=False))
         writer.finish(outcome)
     with Recording(path) as recording:
-        rows = np.arange(recording.num_frames)
         return [
             (statement.row, statement.kind, statement.text)
-            for statement in episode_statements(recording, rows, ("subtask", "plan", "memory"))
+            for statement in episode_statements(recording, ("subtask", "plan", "memory"))
         ]
 
 

@@ -33,7 +33,7 @@ from demorec.datasets.sources import Intake, LeftOut, find_recordings, places_of
 from demorec.mcap import open_recording
 
 _STATED_OPTIONS = (
-    "action", "state", "privileged", "features", "include_failures", "episodes", "fps", "depth", "motor_units", "boxes",
+    "action", "state", "privileged", "features", "include_failures", "episodes", "depth", "motor_units", "boxes",
     "progress",
 )  # fmt: skip
 """Options that decide the content of the episodes; `demorec/export.json` lists them."""
@@ -225,6 +225,5 @@ def _read(path: Path, options: ExportOptions, folder: Path | None) -> ExportedEp
 
 
 def _workers_that_pay(sources: Sequence[Path], options: ExportOptions) -> int:
-    transcodes = options.depth or options.fps is not None
-    size = sum(path.stat().st_size for path in sources) * (20 if transcodes else 1)
+    size = sum(path.stat().st_size for path in sources) * (20 if options.depth else 1)
     return min(available_cores(), 8) if size >= _BYTES_THAT_PAY else 1

@@ -14,7 +14,7 @@ from demorec.annotate import Statement
 from demorec.annotate.boxes import seen_objects
 from demorec.annotate.statements import episode_statements
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError, ExportError
+from demorec.core.errors import ConfigError
 from demorec.datasets.episode import DONE, REWARD, SCALARS, SUCCESS, ExportCamera, ExportEpisode
 from demorec.datasets.lerobot.boxes import SeenByCamera
 from demorec.datasets.lerobot.depth import depth_info, depth_video
@@ -45,7 +45,7 @@ LeRobotEpisode = ExportEpisode[ExportOptions]
 NO_PLACE = (VELOCITY, EE_POSE, REWARD, DONE, SUCCESS)
 """Features that LeRobot does not record from a real arm."""
 _TRANSCODED = VideoConfig(codec="h264", crf=18)
-"""Encoding of images that cannot pass through: jpeg, or with --fps between keyframes."""
+"""Encoding of images that cannot pass through."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -115,7 +115,7 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
     """Read an episode into memory. Raises ConfigError for boxes without segmentation, ExportError if it has no frames,
     or frames without images, and RecordingError if it is damaged.
     """
-    options, recording = episode.options, episode.recording
+    options, recording, fps, columns = episode.options, episode.recording, episode.info.fps, episode.columns
     reasons = reasons_to_transcode(episode)
     videos = recorded_videos(episode, [camera for camera, reason in reasons.items() if not reason])
     pixels: dict[str, PixelHistogram | Statistics] = {}
@@ -123,20 +123,19 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
     for camera in episode.cameras:
         key, settings = camera.feature, recording.video_settings(camera.name)
         if camera.is_depth:
-            videos[key], pixels[key] = depth_video(episode.images(camera), fps=episode.fps)
-            video_infos[key] = depth_info((settings.width, settings.height), episode.fps)
+            videos[key], pixels[key] = depth_video(episode.images(camera), fps=fps)
+            video_infos[key] = depth_info((settings.width, settings.height), fps)
             continue
-        settings = replace(settings, fps=episode.fps, gop=settings.gop if episode.stride == 1 else 1)
         if reasons[camera]:
             videos[key], settings = _transcoded_video(episode, camera)
         video_infos[key] = _video_info(settings)
         found = recording.pixel_statistics(camera.name)
         pixels[key] = PixelHistogram(counts=found.counts, level_values=colour_levels(), num_images=found.num_images)
     language = language_of(episode)
-    language_columns = {} if options.language is None else language_arrays(language, len(episode.rows))
+    language_columns = {} if options.language is None else language_arrays(language, episode.num_frames)
     data = EpisodeData(
         task=episode.info.instruction,
-        columns={**episode.columns, **language_columns},
+        columns={**columns, **language_columns},
         videos=videos,
         video_info=video_infos,
         pixels=pixels,
@@ -144,7 +143,7 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         boxes=_episode_boxes(episode) if options.boxes else {},
     )
     info = DatasetInfo(
-        fps=episode.fps,
+        fps=fps,
         features=_dataset_features(episode, video_infos),
         robot_type=episode.info.robot_name,
     )
@@ -159,7 +158,7 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
             feature.name: feature.source or ", ".join(dict.fromkeys(filter(None, feature.units)))
             for feature in episode.info.features
         },
-        stages=episode_stages(recording, episode.rows) if options.progress else None,
+        stages=episode_stages(recording) if options.progress else None,
     )
 
 
@@ -192,8 +191,8 @@ def language_of(episode: LeRobotEpisode) -> EpisodeLanguage:
     if episode.scene is None:
         statements = [Statement(row=frame, kind="subtask", text=text) for frame, text in recording.subtasks]
     else:
-        statements = episode_statements(recording, episode.rows, options.spoken)
-    return episode_language(statements, fps=episode.fps)
+        statements = episode_statements(recording, options.spoken)
+    return episode_language(statements, fps=episode.info.fps)
 
 
 def _episode_boxes(episode: LeRobotEpisode) -> dict[str, SeenByCamera]:
@@ -201,7 +200,7 @@ def _episode_boxes(episode: LeRobotEpisode) -> dict[str, SeenByCamera]:
     taken = {camera.name for camera in episode.cameras}
     for camera in episode.info.simulated.scene.cameras:
         if camera.name in taken and episode.recording.has_segmentation(camera.name):
-            entries = tuple(seen_objects(episode.recording, episode.rows, camera.name))
+            entries = tuple(seen_objects(episode.recording, camera.name))
             boxes[IMAGE_PREFIX + camera.name] = camera.width, camera.height, entries
     if not boxes:
         raise ConfigError(
@@ -217,24 +216,15 @@ def reasons_to_transcode(episode: LeRobotEpisode) -> dict[ExportCamera, str]:
 
 
 def reason_to_transcode(episode: LeRobotEpisode, camera: ExportCamera) -> str:
-    """Explain why the images of a camera cannot pass through; "" if they can. If frames are left out, the rest stay
-    decodable only if they are all keyframes.
-    """
-    settings = episode.recording.video_settings(camera.name)
-    if settings.codec == "jpeg":
+    """Explain why the images of a camera cannot pass through; "" if they can."""
+    if episode.recording.video_settings(camera.name).codec == "jpeg":
         return "jpeg images are not a video"
-    numbers, stride = episode.numbers(camera), episode.stride
-    if (np.diff(numbers) != stride).any():
+    numbers = episode.numbers(camera)
+    if (np.diff(numbers) != 1).any():
         return "frames show images again, or leave some out"
-    if stride > 1 and (settings.gop == 0 or stride % settings.gop):
-        return f"every {_ordinal(stride)} frame is taken and every {_ordinal(settings.gop)} is a keyframe"
-    if stride == 1 and len(numbers) and _lead(episode.recording, camera.name, int(numbers[0])) > len(numbers):
+    if len(numbers) and _lead(episode.recording, camera.name, int(numbers[0])) > len(numbers):
         return "the keyframe that the first frame needs is further away than the episode is long"
     return ""
-
-
-def _ordinal(number: int) -> str:
-    return {1: "1st", 2: "2nd", 3: "3rd"}.get(number, f"{number}th")
 
 
 def _lead(recording: Recording, camera: str, number: int) -> int:
@@ -246,7 +236,7 @@ def _lead(recording: Recording, camera: str, number: int) -> int:
 
 def _transcoded_video(episode: LeRobotEpisode, camera: ExportCamera) -> tuple[EncodedVideo, VideoSettings]:
     size = episode.recording.video_settings(camera.name)
-    encoder = make_encoder(video=_TRANSCODED, width=size.width, height=size.height, fps=episode.fps)
+    encoder = make_encoder(video=_TRANSCODED, width=size.width, height=size.height, fps=episode.info.fps)
     units = [unit for image in episode.images(camera) for unit in encoder.encode(image)]
     units += encoder.finish()
     lengths = [len(unit) for unit in units]
@@ -261,19 +251,11 @@ def recorded_videos(episode: LeRobotEpisode, cameras: Sequence[ExportCamera]) ->
     videos = {}
     for camera in cameras:
         settings, numbers = recording.video_settings(camera.name), episode.numbers(camera)
-        is_whole = episode.stride == 1
-        lead = _lead(recording, camera.name, int(numbers[0])) if is_whole else 0
+        lead = _lead(recording, camera.name, int(numbers[0]))
         block = recorded.pop(camera.name)
         if lead or len(block) != len(numbers):
-            taken = np.arange(numbers[0] - lead, numbers[-1] + 1) if is_whole else numbers
-            block = block.select(taken.astype(np.intp))
-        video = EncodedVideo.of_access_units(_mp4_codec(settings), block.joined(), block.lengths, lead)
-        if not is_whole and not video.is_keyframe.all():
-            raise ExportError(
-                f"The recording lists every {_ordinal(settings.gop)} image of camera {camera.name} as a keyframe, "
-                f"but the packets differ: {recording.path}"
-            )
-        videos[camera.feature] = video
+            block = block.select(np.arange(numbers[0] - lead, numbers[-1] + 1, dtype=np.intp))
+        videos[camera.feature] = EncodedVideo.of_access_units(_mp4_codec(settings), block.joined(), block.lengths, lead)
     return videos
 
 

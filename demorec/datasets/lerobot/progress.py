@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from demorec.annotate.timeline import StageRun, dense_runs, dense_stages, episode_timeline, progress, proportions
 
@@ -30,9 +29,9 @@ class EpisodeStages(NamedTuple):
     possible: Sequence[str]
 
 
-def episode_stages(recording: Recording, rows: NDArray[np.intp]) -> EpisodeStages:
-    """Return the stages of a simulated episode, whose (T,) recorded frames `rows` are in the dataset."""
-    runs = dense_runs(episode_timeline(recording), rows)
+def episode_stages(recording: Recording) -> EpisodeStages:
+    """Return the stages of a simulated episode."""
+    runs = dense_runs(episode_timeline(recording))
     return EpisodeStages(runs, dense_stages(len(recording.info.simulated.scene.goals), runs))
 
 

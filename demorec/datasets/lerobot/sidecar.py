@@ -119,10 +119,7 @@ def _simulated_row(simulation: Simulation, episode: ExportEpisode[Any]) -> dict[
         "num_retries": outcome.num_retries,
         "final_state_digest": outcome.final_state_digest,
         "checks": [to_plain(check) for check in outcome.checks],
-        "phases": [
-            {"name": name, "from": first, "to": end}
-            for name, first, end in consecutive_runs([trajectory.phase[frame] for frame in episode.rows])
-        ],
+        "phases": [{"name": name, "from": first, "to": end} for name, first, end in consecutive_runs(trajectory.phase)],
         "objects": [
             {"name": name, "world_from_object_end": poses[-1].tolist()}
             for name, poses in trajectory.object_poses.items()

@@ -128,7 +128,7 @@ def _verify(root: Path, samples: Sequence[tuple[int, Path]], options: ExportOpti
 
 def _compare_episode(dataset: Any, episode_index: int, episode: LeRobotEpisode, number: int) -> int:
     first = int(dataset.meta.episodes[episode_index]["dataset_from_index"])
-    length = len(episode.rows)
+    length = episode.num_frames
     # The last frame, where offsets accumulate, and another one that varies between episodes.
     moments = sorted({(number * 37) % length, length - 1})
     language = language_of(episode)

@@ -65,7 +65,7 @@ def _write(
                 intake.take(path, episode.traits())
                 _add(data, intake.num_taken - 1, episode)
                 depth_left_out = depth_left_out or episode.depth_left_out
-                num_frames += len(episode.rows)
+                num_frames += episode.num_frames
                 file.flush()
             else:
                 intake.leave_out(reason)
@@ -111,7 +111,7 @@ def _add(data: h5py.Group, number: int, episode: Hdf5Episode) -> None:
 
 def _fill(demo: h5py.Group, episode: Hdf5Episode) -> None:
     observations, images = _observation_names(episode), _image_names(episode)
-    count = len(episode.rows)
+    count = episode.num_frames
     demo.attrs["num_samples"] = count
     demo.attrs["instruction"] = episode.info.instruction
     if urdf := episode.urdf:
@@ -187,7 +187,7 @@ def _attributes(episode: Hdf5Episode) -> dict[str, str | int]:
     """Return the attributes of `data`: arguments of robomimic's environment, rate and observation names."""
     info, options = episode.info, episode.options
     colour = [camera.name for camera in episode.cameras if not camera.is_depth]
-    arguments: dict[str, object] = {"robot": info.robot_name, "fps": episode.fps, "cameras": colour}
+    arguments: dict[str, object] = {"robot": info.robot_name, "fps": info.fps, "cameras": colour}
     name = _NO_ENVIRONMENT
     if episode.scene is not None:
         name = environment_name(info.simulated.task)
@@ -200,7 +200,7 @@ def _attributes(episode: Hdf5Episode) -> dict[str, str | int]:
         }
     return {
         "env_args": json.dumps({"env_name": name, "type": _GYM, "env_kwargs": arguments}),
-        "fps": episode.fps,
+        "fps": info.fps,
         "observations": json.dumps([*_observation_names(episode), *_image_names(episode)]),
     }
 
@@ -211,7 +211,7 @@ def _states(episode: Hdf5Episode) -> tuple[NDArray[np.float64], tuple[str, ...]]
     parts = [trajectory.joint_position, trajectory.joint_velocity, *trajectory.object_poses.values()]
     names = [f"{joint}.{what}" for what in ("pos", "vel") for joint in joints]
     names += [f"{body}.{axis}" for body in trajectory.object_poses for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
-    return np.concatenate(parts, axis=1)[episode.rows], tuple(names)
+    return np.concatenate(parts, axis=1), tuple(names)
 
 
 def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], components: Sequence[str]) -> None:
