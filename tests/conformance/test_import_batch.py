@@ -1,4 +1,4 @@
-"""Imports of many bags: an unreadable bag does not stop the others; workers and interrupts do not change the result."""
+"""Imports of many bags: an unreadable bag does not stop the others; interrupts do not change the result."""
 
 from __future__ import annotations
 
@@ -131,13 +131,12 @@ def test_bad_bags_are_skipped_and_listed(
     assert "run_1.mcap: The bag is empty" in judged.findings[0].message
 
 
-def test_the_run_is_the_same_for_any_number_of_workers(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
+def test_each_bag_of_a_batch_is_reported_in_order(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
     done: list[tuple[int, int]] = []
     told: list[BagReport] = []
     result = import_bags(
-        [batch[0]], batch[1], tmp_path / "run", workers=3, skip_bad=True, tell=told.append,
-        progress=lambda *counts: done.append(counts),
-    )  # fmt: skip
+        [batch[0]], batch[1], tmp_path / "run", skip_bad=True, tell=told.append, progress=lambda *c: done.append(c)
+    )
     assert _content(tmp_path / "run") == _content(alone)
     assert load_any_run_file(tmp_path / "run").digest == load_any_run_file(alone).digest
     assert tuple(told) == result.reports
@@ -153,7 +152,7 @@ def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_agai
     assert (again.num_new, len(again.skipped)) == (0, len(BAD))
     assert _content(run) == before
     _bag(folder / "run_1.mcap", 1.3)
-    result = import_bags([folder], mapping, run, skip_bad=True, workers=2)
+    result = import_bags([folder], mapping, run, skip_bad=True)
     assert (result.num_new, len(result.skipped)) == (1, len(BAD) - 1)
     assert folder / "run_1.mcap" not in result.skipped
     after = _content(run)
@@ -215,23 +214,16 @@ def test_a_folder_means_its_bags_in_natural_order(tmp_path: Path) -> None:
         import_bags([folder / "photos"], mapping, tmp_path / "run")
 
 
-@pytest.mark.parametrize(
-    ("flags", "told"),
-    [(["--skip-bad"], "--skip-bad: only for datasets"), (["--workers", "2"], "--workers: only for bags")],
-)
-def test_flags_of_other_sources_are_refused(
-    flags: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert exit_code("import", "hdf5", "x", "--mapping", "x", *flags, "--out", tmp_path / "run") == 2
-    assert told in capsys.readouterr().err
+def test_flags_of_other_sources_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code("import", "hdf5", "x", "--mapping", "x", "--skip-bad", "--out", tmp_path / "run") == 2
+    assert "--skip-bad: only for datasets" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_bags_before_a_bad_one_are_imported(workers: int, tmp_path: Path) -> None:
+def test_bags_before_a_bad_one_are_imported(tmp_path: Path) -> None:
     good = [_bag(tmp_path / f"{number}.mcap", 0.5 + 0.1 * number) for number in range(3)]
     good[1].write_bytes(b"")
     mapping, run = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml"), tmp_path / "run"
     with pytest.raises(BagError, match="The bag is empty"):
-        import_bags(good, mapping, run, workers=workers)
+        import_bags(good, mapping, run)
     assert [path.name for path in run.glob("episodes/*")] == ["episode_000000.mcap"]
     assert len(load_any_run_file(run).attempts) == 1

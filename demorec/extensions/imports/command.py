@@ -12,7 +12,7 @@ from demorec.cli.shared.flags import Positional, arg
 from demorec.cli.shared.output import ProgressBar, aligned, counted, say, size_in_words, tell
 from demorec.cli.shared.paths import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags, refuse_inside
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError, check_option
+from demorec.core.errors import ConfigError
 from demorec.core.extension import ReaderRow, reader_rows
 from demorec.core.registry import nearest_match
 from demorec.core.replacing import OptionalTarget
@@ -64,8 +64,6 @@ class Import:
     """Leave out bags that cannot be read, or do not fit the mapping or the other bags, and unreadable episodes of a
     dataset; list them at the end and exit with 1. Otherwise the first of them ends the import.
     """
-    workers: int = 1
-    """Processes that read and write bags; the recordings are the same for any number."""
     suggest: bool = False
     """Write a mapping for the first bag or file to standard output instead of importing."""
     motors: MotorsByFlags = field(default_factory=MotorFlags)
@@ -79,7 +77,6 @@ class Import:
             raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
         if self.out is not None:
             refuse_inside([self.out])
-        check_option("workers", self.workers, 1, 1024)
         word = str(self.bags[0])
         form = _FORMATS.get(word, BAGS)
         self._check_flags(form)
@@ -116,8 +113,6 @@ class Import:
 
     def _check_flags(self, form: ReaderRow) -> None:
         """Raise ConfigError for flags of another format."""
-        if form is not BAGS and self.workers > 1:
-            raise ConfigError("--workers: only for bags, leave it out.")
         of_datasets = {
             "--motor-units": self.motors.named,
             "--state, --action and --gripper": self.roles.named,
@@ -152,7 +147,6 @@ class Import:
                 mapping,
                 out,
                 video=self.video,
-                workers=self.workers,
                 skip_bad=self.skip_bad,
                 tell=lambda report: say(*_report_lines(report), ""),
                 progress=bar.set,

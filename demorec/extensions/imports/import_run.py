@@ -1,24 +1,18 @@
 """Import of bags to a run: every bag is read and judged as a whole, and only then written, as one episode.
 
-The same command continues: bags in import.json are not imported again, existing episodes are not written again. Several
-processes may read and write; bags are numbered and added to the run in order.
+The same command continues: bags in import.json are not imported again, existing episodes are not written again.
 """
 
 from __future__ import annotations
 
 import os
-from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, resource_error, without_path
 from demorec.core.plain import to_plain
-from demorec.core.processes import process_pool
 from demorec.extensions.imports.bag import Files, bags_in, open_bag
 from demorec.extensions.imports.bag_images import write_bag
 from demorec.extensions.imports.description import urdf_text
@@ -29,7 +23,6 @@ from demorec.extensions.imports.planning import ImportSettings, PlannedBag, plan
 from demorec.runs.external import ExternalFolder, differences, open_external_run
 from demorec.runs.run_file import Attempt
 
-_Read = Callable[[], tuple[Files, PlannedBag | None]]
 _MAX_REASON = 1000
 """Maximum characters: an error may quote a bag's content."""
 
@@ -67,34 +60,25 @@ class BagsImport:
             if kinds := sorted({finding.kind for finding in report.odd}):
                 yield f"{report.name}: findings in the bag ({', '.join(kinds)}), which demorec check lists"
 
-    def accepted(
-        self, bags: Iterable[tuple[Path, _Read]], folder: ExternalFolder, *, skip_bad: bool
-    ) -> Iterator[PlannedBag | None]:
-        """Yield each bag with the number of its episode; None for one that is in the run or is skipped.
+    def plan(self, path: Path, folder: ExternalFolder, settings: ImportSettings) -> PlannedBag | None:
+        """Read and judge a bag; None if one with the same bytes is in the run.
 
         Raises:
             BagError, ConfigError: It cannot be read, or does not fit the mapping or the run.
         """
-        kind, index = folder.kind(), len(self.known.bags)
-        for path, read in bags:
-            new = None
-            try:
-                files, planned = read()
-                if planned and files not in self.files.values():
-                    new, kind = planned.numbered(index), kind or planned.info
-                    if different := differences(kind, planned.info):
-                        raise ConfigError(
-                            f"The run's episodes differ from the bag's ({'; '.join(different)}): import it into "
-                            f"another folder: {path}"
-                        )
-                self.files[path] = files
-            except Exception as error:
-                new = None
-                self.skipped[path] = _why_skipped(path, error, is_allowed=skip_bad)
-            if new:
-                folder.begin(new.info)
-                index += 1
-            yield new
+        bag = open_bag(path)
+        files = bag.sha256s()
+        planned = None
+        if files not in {report.files for report in self.known.bags}:
+            planned = plan_bag(bag, files, settings, episode_index=len(self.known.bags))
+            kind = folder.kind()
+            if kind and (different := differences(kind, planned.info)):
+                raise ConfigError(
+                    f"The run's episodes differ from the bag's ({'; '.join(different)}): import it into another "
+                    f"folder: {path}"
+                )
+        self.files[path] = files
+        return planned
 
     def add(self, report: BagReport, lines: Sequence[Attempt], folder: ExternalFolder) -> None:
         """Add a written bag to the run; run.json, which marks it as done, is written last."""
@@ -118,7 +102,6 @@ def import_bags(
     out: Path,
     *,
     video: VideoConfig | None = None,
-    workers: int = 1,
     skip_bad: bool = False,
     tell: Callable[[BagReport], None] = lambda report: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -129,7 +112,6 @@ def import_bags(
         paths: Bags, each of which is one episode; or folders of bags.
         out: The run's folder; a run started with the same mapping is continued.
         video: Encoding of images that arrive as pixels.
-        workers: Number of processes that read and write; the recordings do not depend on it.
         skip_bad: Whether to leave out bags that cannot be read, or do not fit the mapping or the other bags. Otherwise
         the first of them ends the import before any of it is written.
         tell: Called with the report of each newly read bag, in order.
@@ -139,7 +121,6 @@ def import_bags(
         ConfigError: The mapping is impossible, or the folder holds other files.
         BagError: A bag cannot be read, does not fit the mapping, or would yield an incomplete episode.
         RecordingError: The disk is full or gone.
-        ResourceError: A process of the import was killed.
     """
     mapping = read_mapping(mapping_path)
     urdf = urdf_text(mapping, mapping_path)
@@ -149,19 +130,20 @@ def import_bags(
         if not os.path.lexists(path):  # a mistyped name is not a bad bag
             open_bag(path)
     batch, settings = BagsImport(known=known), ImportSettings(mapping=mapping, urdf=urdf, video=video or VideoConfig())
-    done = {report.files for report in known.bags}
     progress(0, len(given))
-    with open_external_run(out, recovers=False) as folder, _processes(workers) as start:
+    with open_external_run(out, recovers=False) as folder:
         folder.planned = [path.name for path in given]
-
-        def write(planned: PlannedBag | None) -> Callable[[], list[Attempt]]:
-            is_missing = planned and not folder.has(planned.info)
-            return start(write_bag, planned, folder.path, settings) if is_missing else list
-
-        read = _in_order(lambda path: start(_read, path, done, settings), given, workers)
-        accepted = batch.accepted(read, folder, skip_bad=skip_bad)
-        for number, (planned, written) in enumerate(_in_order(write, accepted, workers), 1):
-            lines = written()
+        for number, path in enumerate(given, start=1):
+            planned: PlannedBag | None = None
+            lines: list[Attempt] = []
+            try:
+                planned = batch.plan(path, folder, settings)
+            except Exception as error:
+                batch.skipped[path] = _why_skipped(path, error, is_allowed=skip_bad)
+            if planned is not None:
+                folder.begin(planned.info)
+                if not folder.has(planned.info):
+                    lines = write_bag(planned, folder.path, settings)
             folder.planned = folder.planned[1:]
             if planned is not None:
                 batch.add(planned.report, lines, folder)
@@ -179,39 +161,6 @@ def _known(out: Path, mapping: SourceMapping) -> ImportFile:
     if known.mapping_digest != mapping.digest:
         raise ConfigError(f"The run was imported by another mapping: choose another --out: {out}")
     return known
-
-
-def _read(path: Path, done: Collection[Files], settings: ImportSettings) -> tuple[Files, PlannedBag | None]:
-    """Read and judge a bag, unless one with the same bytes is in the run."""
-    bag = open_bag(path)
-    files = bag.sha256s()
-    return files, None if files in done else plan_bag(bag, files, settings)
-
-
-@contextmanager
-def _processes(workers: int) -> Iterator[Callable[..., Callable[[], Any]]]:
-    """Yield a function that starts a call and returns a getter of its result; a single worker is this process."""
-    if workers == 1:
-        yield partial
-        return
-    with process_pool(workers) as pool:
-        yield lambda *call: pool.submit(*call).result
-
-
-def _in_order[Item, Result](
-    start: Callable[[Item], Result], items: Iterable[Item], ahead: int
-) -> Iterator[tuple[Item, Result]]:
-    """Yield each item with its started call, up to `ahead` at a time; items before an error come before it."""
-    waiting: deque[tuple[Item, Result]] = deque()
-    try:
-        for item in items:
-            waiting.append((item, start(item)))
-            if len(waiting) >= ahead:
-                yield waiting.popleft()
-    except Exception:
-        yield from waiting
-        raise
-    yield from waiting
 
 
 def _why_skipped(path: Path, error: Exception, *, is_allowed: bool) -> str:

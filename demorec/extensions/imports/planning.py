@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,11 +35,6 @@ class PlannedBag:
     info: EpisodeInfo
     rows: EpisodeRows
 
-    def numbered(self, episode_index: int) -> PlannedBag:
-        """Renumber the episode for a run."""
-        report = replace(self.report, episode_index=episode_index)
-        return replace(self, report=report, info=replace(self.info, episode_index=episode_index))
-
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings:
@@ -50,8 +45,8 @@ class ImportSettings:
     video: VideoConfig
 
 
-def plan_bag(bag: Bag, files: Files, settings: ImportSettings) -> PlannedBag:
-    """Read and judge a bag; its episode has the number 0.
+def plan_bag(bag: Bag, files: Files, settings: ImportSettings, *, episode_index: int) -> PlannedBag:
+    """Read and judge a bag, which becomes the episode of this number in its run.
 
     Raises:
         BagError: It cannot be read, does not fit the mapping, or would yield an incomplete episode.
@@ -64,7 +59,7 @@ def plan_bag(bag: Bag, files: Files, settings: ImportSettings) -> PlannedBag:
             rows = lines.rows()
         except BagError as error:
             raise BagError(f"The bag yields no complete episode: {error}{_reported(findings)}") from error
-        info = _info(bag, files, lines, rows, settings)
+        info = _info(bag, files, lines, rows, settings, episode_index)
         if wrong := list(_problems(info, rows, settings.video)):
             raise FieldError("; ".join(wrong))
     except FieldError as error:
@@ -78,7 +73,7 @@ def plan_bag(bag: Bag, files: Files, settings: ImportSettings) -> PlannedBag:
         num_bytes=bag.num_bytes,
         streams=tuple(stream_figures(line, times_ns) for line in lines.lines.values()),
         findings=(*findings, *row_findings(lines, rows)),
-        episode_index=0,
+        episode_index=episode_index,
         begin_s=(int(times_ns[0]) - begin_ns) / NS,
         end_s=(int(times_ns[-1]) - begin_ns) / NS,
         num_frames=len(times_ns),
@@ -95,7 +90,9 @@ def _reported(findings: Sequence[ImportFinding]) -> str:
     return f" (the bag's report: {'; '.join(kinds)})" if kinds else ""
 
 
-def _info(bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, settings: ImportSettings) -> EpisodeInfo:
+def _info(
+    bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, settings: ImportSettings, episode_index: int
+) -> EpisodeInfo:
     """Describe the episode; BagError or FieldError if the bag has no robot description or task."""
     mapping, urdf = settings.mapping, settings.urdf
     if topic := mapping.robot.urdf_topic:
@@ -104,7 +101,7 @@ def _info(bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, settings:
             raise BagError(f"{topic} holds no robot description")
     return imported_info(
         mapping,
-        episode_index=0,
+        episode_index=episode_index,
         instruction=stated_task(mapping.task, bag.name),
         urdf=urdf,
         fps=mapping.clock.fps,
