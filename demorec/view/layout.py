@@ -83,7 +83,30 @@ def _view_3d(episode: Playback) -> rrb.Spatial3DView:
         background=BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
         spatial_information=rrb.SpatialInformation(target_frame="tf#/", show_axes=False),
+        eye_controls=_eye(episode),
         overrides={Paths.ee_path: [rrb.VisibleTimeRanges(past), rr.LineStrips3D.from_fields()]},
+    )
+
+
+def _eye(episode: Playback) -> rrb.EyeControls3D | None:
+    """Choose the 3D viewpoint: looking at the gripper's trajectory from the side, with the arm in view.
+
+    None if the trajectory is unknown, so that the viewer chooses.
+    """
+    if episode.motion.base_from_tcp is None:
+        return None
+    base = episode.world_from_base
+    points = base.apply(episode.motion.base_from_tcp[:, :3])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else base.apply((0.5, 0.0, 0.2))
+    target = 0.7 * middle + 0.3 * base.apply((0.2, 0.0, 0.4))
+    side = base.rotation[:, 1]
+    forward = base.rotation[:, 0]
+    eye = target + 0.15 * forward - 1.05 * side + (0.0, 0.0, 0.42)
+    return rrb.EyeControls3D(
+        kind=rrb.components.Eye3DKind.Orbital,
+        position=eye.tolist(),
+        look_target=target.tolist(),
+        eye_up=(0.0, 0.0, 1.0),
     )
 
 
