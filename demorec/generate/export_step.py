@@ -31,9 +31,9 @@ def export_run(
 ) -> tuple[ExportRecord, ExportReport | None]:
     """Export the successful episodes of a run to its dataset/, unless it exists already.
 
-    A dataset that this run made from other content is replaced; one
-    that it did not make is left alone. One that it made but that is damaged, was changed, or contains other files, is
-    moved to unfinished/ and made again. So is an edited card.
+    A dataset that this run made from other content is replaced; one that it did not make is left alone. One that it
+    made but that is damaged, was changed, or contains other files, is moved to unfinished/ and made again. So is an
+    edited card.
 
     Returns the dataset's record in run.json, and the export's report if it was made now.
 

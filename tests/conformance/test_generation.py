@@ -98,9 +98,8 @@ def reproduce(source: Path, out: Path) -> int:
 
 
 @pytest.mark.usefixtures("without_lerobot")
-def test_the_export_is_made_once_and_again_when_the_run_has_grown(tmp_path: Path, reference: RunResult) -> None:
+def test_the_export_is_made_once_and_again_when_the_run_has_grown(tmp_path: Path) -> None:
     out = tmp_path / "run"
-    shutil.copytree(reference.folder, out)
     make(out, workers=1, num_episodes=NUM_EPISODES - 1)
     first, report = export_run(out, repo_id="me/cubes")
     assert report is not None
