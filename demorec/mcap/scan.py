@@ -17,6 +17,7 @@ from io import BytesIO
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
@@ -160,6 +161,9 @@ def chunk_content(record: bytes | memoryview, expected_size: int | None = None) 
     Any exception of mcap, zstandard or lz4, or ValueError, if it is damaged or has an unexpected size.
     """
     chunk = read_record(record, Chunk)
+    # If the compressed data state their size, zstandard allocates that much, whatever the chunk states.
+    if chunk.compression == "zstd" and zstandard.frame_content_size(chunk.data) not in (chunk.uncompressed_size, -1):
+        raise ValueError("a chunk with a different size from its compressed data")
     stream, size = get_chunk_data_stream(chunk, validate_crc=True)
     if size != chunk.uncompressed_size or expected_size not in (None, size):
         raise ValueError("a chunk has another size than stated")
