@@ -66,8 +66,8 @@ def read_columns(
         at = np.concatenate(times[stream.topic])
         if not np.array_equal(at, time_ns):
             raise RecordingError(
-                f"The recording has {len(at)} messages on {stream.topic} at other times than its {len(time_ns)} "
-                f"frames: {container.path}"
+                f"The recording has {len(at)} messages on {stream.topic}, not one at the time of each of its "
+                f"{len(time_ns)} frames: {container.path}"
             )
         stream.add_columns(np.concatenate(values[stream.topic]), columns)
     if due_ns is None:
