@@ -235,7 +235,7 @@ class RobotSpec:
             values = getattr(self, name)
             if len(values) != len(self.arm_joints):
                 raise ValueError(f"{name} has {len(values)} numbers for {len(self.arm_joints)} arm joints")
-            if name.endswith("_limit") and min(values, default=1.0) <= 0:
+            if name.endswith("_limit") and not all(value > 0 for value in values):  # NaN is not
                 raise ValueError(f"{name} has numbers that are not above 0")
 
     @property

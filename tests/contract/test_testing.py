@@ -92,3 +92,5 @@ def test_a_robot_has_as_many_numbers_as_joints_and_limits_above_zero() -> None:
         replace(panda, velocity_limit=(1.0, 2.0))
     with pytest.raises(ValueError, match="torque_limit has numbers that are not above 0"):
         replace(panda, torque_limit=(0.0,) * 7)
+    with pytest.raises(ValueError, match="velocity_limit has numbers that are not above 0"):
+        replace(panda, velocity_limit=(float("nan"),) * 7)
