@@ -28,6 +28,7 @@ raise SystemExit(code if code >= 0 else 128 - code)
 START = """
 import os, signal, sys, time
 from demorec.core import limited
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored under nohup
 limited.READING_CPU_S, limited.CPU_S_PER_MB = int(os.environ.get("TEST_CPU_S", 20)), 1
 limited.continue_in_child(sys.argv[1:])
 """
