@@ -8,7 +8,6 @@ with open_recording(path) as recording:
 from demorec.mcap.images import PixelStatistics
 from demorec.mcap.recording import Recording, open_recording, open_simulated
 from demorec.mcap.recover import Recovered, is_whole, recover
-from demorec.mcap.sampled_writer import SampledWriter
 from demorec.mcap.simulated_writer import EpisodeWriter
 from demorec.mcap.video import VideoPacket, VideoSettings
 
@@ -17,7 +16,6 @@ __all__ = [
     "PixelStatistics",
     "Recording",
     "Recovered",
-    "SampledWriter",
     "VideoPacket",
     "VideoSettings",
     "is_whole",

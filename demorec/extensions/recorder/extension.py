@@ -1,0 +1,7 @@
+"""Declaration of the recorder."""
+
+from __future__ import annotations
+
+from demorec.core.extension import Extension
+
+EXTENSION = Extension(name="recorder", summary="record any robot, simulator or program: `demorec.Recorder`")
