@@ -17,7 +17,6 @@ EXTENSION = Extension(
         "info": CommandRow(target="demorec.cli.info:Info", group="look", limits="reading"),
         "view": CommandRow(target="demorec.cli.view:View", group="look", limits="reading"),
         "export": CommandRow(target="demorec.cli.export:Export", group="make", limits="reading"),
-        "recover": CommandRow(target="demorec.cli.recover:Recover", group="repair", limits="reading"),
         "list": CommandRow(target="demorec.cli.list_rows:ListRows", group="look"),
     },
     tasks={

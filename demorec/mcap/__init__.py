@@ -7,7 +7,6 @@ with open_recording(path) as recording:
 
 from demorec.mcap.images import PixelStatistics
 from demorec.mcap.recording import Recording, open_recording, open_simulated
-from demorec.mcap.recover import Recovered, is_whole, recover
 from demorec.mcap.simulated_writer import EpisodeWriter
 from demorec.mcap.video import VideoPacket, VideoSettings
 
@@ -15,11 +14,8 @@ __all__ = [
     "EpisodeWriter",
     "PixelStatistics",
     "Recording",
-    "Recovered",
     "VideoPacket",
     "VideoSettings",
-    "is_whole",
     "open_recording",
     "open_simulated",
-    "recover",
 ]

@@ -4,4 +4,8 @@ from __future__ import annotations
 
 from demorec.core.extension import Extension
 
-EXTENSION = Extension(name="recorder", summary="record any robot, simulator or program: `demorec.Recorder`")
+EXTENSION = Extension(
+    name="recorder",
+    summary="record any robot, simulator or program: `demorec.Recorder`",
+    needs=("recovery",),
+)
