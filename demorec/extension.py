@@ -19,19 +19,7 @@ EXTENSION = Extension(
         "export": CommandRow(target="demorec.cli.export:Export", group="make", limits="reading"),
         "list": CommandRow(target="demorec.cli.list_rows:ListRows", group="look"),
     },
-    tasks={
-        "pick_place": "demorec.tasks.pick:PickPlace",
-        "place_in_tray": "demorec.tasks.pick:PlaceInTray",
-        "stack": "demorec.tasks.cubes:Stack",
-        "stack_three": "demorec.tasks.cubes:StackThree",
-        "unstack": "demorec.tasks.cubes:Unstack",
-        "sort_by_color": "demorec.tasks.pick:SortByColor",
-        "line_up": "demorec.tasks.cubes:LineUp",
-        "pick_from_clutter": "demorec.tasks.pick:PickFromClutter",
-        "pick_shapes": "demorec.tasks.pick:PickShapes",
-        "pick_anything": "demorec.tasks.anything:PickAnything",
-        "tutorial": "demorec.tasks.tutorial:Tutorial",
-    },
+    tasks={"pick_place": "demorec.tasks.pick:PickPlace"},
     robots={
         "panda": "demorec.robots.panda:PANDA",
         "iiwa": "demorec.robots.iiwa:IIWA",
@@ -42,11 +30,6 @@ EXTENSION = Extension(
         "wrist": "demorec.render.cameras:WRIST",
         "top": "demorec.render.cameras:TOP",
         "workspace": "demorec.render.cameras:WORKSPACE",
-    },
-    objects={
-        "household": "demorec.objects.catalog:HOUSEHOLD",
-        "blocks": "demorec.objects.catalog:BLOCKS",
-        "cubes": "demorec.objects.catalog:CUBES",
     },
     renderers={
         "raster": "demorec.render.raster:RasterRenderer",

@@ -25,8 +25,8 @@ BROKEN = {
     "missing": ("OTHER = 1", "AttributeError"),
     "other kind": ("EXTENSION = 1", "is not a demorec.core.extension.Extension"),
     "clash": (
-        f"{IMPORT}\nEXTENSION = Extension(name='x', summary='', tasks={{'stack': 'nowhere:Stack'}})",
-        "core has tasks with the same name: stack",
+        f"{IMPORT}\nEXTENSION = Extension(name='x', summary='', tasks={{'pick_place': 'nowhere:Pick'}})",
+        "core has tasks with the same name: pick_place",
     ),
     "needs": (
         f"{IMPORT}\nEXTENSION = Extension(name='z', summary='', needs=('y',))",

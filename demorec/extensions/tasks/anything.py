@@ -13,14 +13,15 @@ from demorec.core.geometry import Pose
 from demorec.episode.mesh import decode_mesh, encode_mesh
 from demorec.episode.scene import Body, Goal, Rgba, Role, Scene, Shape, Texture
 from demorec.episode.words import VESSELS
+from demorec.extensions.tasks.pick import IN_TRAY, TRAY_FLOOR, TRAYS, tray
+from demorec.extensions.tasks.solids import dish
+from demorec.extensions.tasks.things import OTHER_COLORS, walls
 from demorec.objects.shelf import MATERIALS, Kind, Material
-from demorec.objects.solids import dish
 from demorec.robots.robot import RobotSpec
 from demorec.sim.solids import ROLLING_FRICTION, at_rest, with_parts
 from demorec.tasks.base import Layout, TableTask
-from demorec.tasks.furniture import COLORS, OTHER_COLORS, green_target, walls, words_for
+from demorec.tasks.furniture import COLORS, green_target, words_for
 from demorec.tasks.grasping import found_grasps
-from demorec.tasks.pick import IN_TRAY, TRAY_FLOOR, TRAYS, tray
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
 
 BESIDE_TRAY = Region(x=(0.33, 0.68), y=(-0.30, 0.15))
