@@ -5,14 +5,12 @@ with open_recording(path) as recording:
     recording.images("front")      # decoded images
 """
 
-from demorec.mcap.images import PixelStatistics
 from demorec.mcap.recording import Recording, open_recording, open_simulated
 from demorec.mcap.simulated_writer import EpisodeWriter
 from demorec.mcap.video import VideoPacket, VideoSettings
 
 __all__ = [
     "EpisodeWriter",
-    "PixelStatistics",
     "Recording",
     "VideoPacket",
     "VideoSettings",

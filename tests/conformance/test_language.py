@@ -24,7 +24,7 @@ from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
 from demorec.episode.words import NOUNS, nouns_of
-from demorec.extensions.tasks.things import THINGS
+from demorec.extensions.tasks.pick import THINGS
 from demorec.mcap import Recording
 
 RECIPE = Path(__file__).parents[2] / "examples" / "language_recipe.yaml"

@@ -1,7 +1,5 @@
 """Declaration of the import of bags, HDF5 files and LeRobot datasets."""
 
-from __future__ import annotations
-
 from demorec.core.extension import CommandRow, Extension, ReaderRow
 
 EXTENSION = Extension(

@@ -1,7 +1,5 @@
 """Declaration of the executor on Ray."""
 
-from __future__ import annotations
-
 from demorec.core.extension import Extension
 
 EXTENSION = Extension(

@@ -1,7 +1,5 @@
 """Declaration of the recorder."""
 
-from __future__ import annotations
-
 from demorec.core.extension import Extension
 
 EXTENSION = Extension(

@@ -1,7 +1,5 @@
 """Declaration of further tasks and of object sets."""
 
-from __future__ import annotations
-
 from demorec.core.extension import Extension
 
 EXTENSION = Extension(
