@@ -14,10 +14,10 @@ from demorec.episode.mesh import decode_mesh, encode_mesh
 from demorec.episode.scene import Body, Goal, Rgba, Role, Scene, Shape, Texture
 from demorec.episode.words import VESSELS
 from demorec.extensions.tasks.pick import IN_TRAY, OTHER_COLORS, TRAY_FLOOR, TRAYS, tray
+from demorec.extensions.tasks.solid_physics import ROLLING_FRICTION, at_rest, with_parts
 from demorec.extensions.tasks.solids import dish
 from demorec.objects.shelf import MATERIALS, Kind, Material
 from demorec.robots.robot import RobotSpec
-from demorec.sim.solids import ROLLING_FRICTION, at_rest, with_parts
 from demorec.tasks.base import Layout, TableTask
 from demorec.tasks.furniture import COLORS, TABLE_HEIGHT, green_target, words_for
 from demorec.tasks.grasping import found_grasps

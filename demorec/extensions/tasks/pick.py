@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Goal, Role, Shape
-from demorec.sim.solids import ROLLING_FRICTION
+from demorec.extensions.tasks.solid_physics import ROLLING_FRICTION
 from demorec.tasks.base import Layout, TableTask, on_table, random_cube, start_and_target
 from demorec.tasks.furniture import COLORS, green_target
 from demorec.tasks.sampling import Region, Sampler
