@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from demorec.tasks.anything import PickAnything
+from demorec.extensions.tasks.anything import PickAnything
 from demorec.tasks.base import Layout
 from demorec.tasks.sampling import Sampler
 

@@ -53,11 +53,13 @@ if TYPE_CHECKING:
     from demorec.extensions.doctor.evidence import Evidence as Evidence
     from demorec.extensions.policies.gym_env import DemorecEnv as DemorecEnv
     from demorec.extensions.policies.gym_env import env_id as env_id
+    from demorec.extensions.recorder.recorder import RecordedEpisode as RecordedEpisode
+    from demorec.extensions.recorder.recorder import Recorder as Recorder
+    from demorec.generate.executor import Executor as Executor
+    from demorec.generate.executor import attempt_episode as attempt_episode
     from demorec.mcap import EpisodeWriter as EpisodeWriter
     from demorec.mcap import Recording as Recording
     from demorec.mcap import open_recording as open_recording
-    from demorec.mcap.recorder import RecordedEpisode as RecordedEpisode
-    from demorec.mcap.recorder import Recorder as Recorder
     from demorec.objects.shelf import Shelf as Shelf
     from demorec.render import Renderer as Renderer
     from demorec.render.cameras import CameraPreset as CameraPreset
@@ -99,7 +101,7 @@ if TYPE_CHECKING:
 
 GROUPS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
     "Record": {
-        "demorec.mcap.recorder": ("Recorder", "RecordedEpisode"),
+        "demorec.extensions.recorder.recorder": ("Recorder", "RecordedEpisode"),
     },
     "Read": {
         "demorec.mcap": ("open_recording", "Recording"),
@@ -153,6 +155,7 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "demorec.core.replacing": ("ReplaceableKind",),
         "demorec.check.base": ("check", "Fault", "NotMeasuredError"),
         "demorec.extensions.doctor.evidence": ("Evidence", "EpisodeEvidence"),
+        "demorec.generate.executor": ("Executor", "attempt_episode"),
         "demorec.cli.shared.flags": ("Positional",),
         "demorec.cli.shared.output": ("say",),
     },

@@ -158,7 +158,7 @@ def _overview(commands: Registry[type[Command]], prog: str, about: str) -> list[
         return lines + _summaries(commands, commands.names())
     for group in GROUPS:
         names = [name for name, row in command_rows().items() if row.group == group]
-        lines += [f"{group}:", *_summaries(commands, names), ""]
+        lines += [f"{group}:", *_summaries(commands, names), ""] if names else []
     return [*lines, "generate-dataset ... is the same as demorec generate ..."]
 
 

@@ -43,7 +43,6 @@ class Generate:
       generate-dataset --num-episodes 50 --out recordings/cubes
       generate-dataset --config run.toml --seed 7        (flags override the file)
       generate-dataset --cameras front wrist --width 320 --height 240 --codec av1
-      generate-dataset --executor ray --address auto --out /shared/cubes
       generate-dataset --config cubes/run.json --out again   (compares bit for bit)
     """
 

@@ -68,7 +68,7 @@ class GenerateConfig:
     task: str = "pick_place"
     """Task of the robot: a name from `demorec list tasks`, or my_package.my_module:MyTask."""
     fixed: Rare[bool] = False
-    """Use the task's single fixed layout instead of random ones, if it has one (tutorial)."""
+    """Use the task's single fixed layout instead of random ones, if it has one."""
     robot: str = "panda"
     """Robot arm: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
     seed: int = 0

@@ -120,6 +120,8 @@ class Extension:
         readers: Kind of path -> reader. "dataset", "hdf5" and "rosbag" are kinds that the core knows.
         tasks, robots, cameras, objects, renderers: Name -> subclass of `Task`, `RobotSpec`, `CameraPreset`, `Shelf`,
         class with the methods of `Renderer`.
+        executors: Name for `--executor` of `generate-dataset` -> context manager of `RunOptions` that connects to other
+            machines and returns a function (maker, folder) that makes a `demorec.generate.executor.Executor`.
         exporters: Name -> format for exporting recordings.
         file_checks: Name -> `demorec.check.base.Check` of the integrity of recordings, runs and their datasets.
         checks: Name -> check of any dataset, for the extension that judges datasets.
@@ -142,6 +144,7 @@ class Extension:
     cameras: Rows = field(default_factory=dict)
     objects: Rows = field(default_factory=dict)
     renderers: Rows = field(default_factory=dict)
+    executors: Rows = field(default_factory=dict)
     exporters: Mapping[str, ExporterRow] = field(default_factory=dict)
     file_checks: Rows = field(default_factory=dict)
     checks: Rows = field(default_factory=dict)

@@ -1,7 +1,5 @@
 """Marks of options, which are fields of dataclasses."""
 
-from __future__ import annotations
-
 from typing import Annotated, TypeVar
 
 T = TypeVar("T")

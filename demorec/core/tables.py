@@ -28,6 +28,7 @@ CAMERAS: Registry[CameraPreset] = Registry(
 )
 OBJECTS: Registry[Shelf] = Registry(kind="shelf", rows=targets_of("objects"), instance_of="demorec.objects.shelf:Shelf")
 RENDERERS: Registry[type[Renderer]] = Registry(kind="renderer", rows=targets_of("renderers"))
+EXECUTORS: Registry[Callable[..., Any]] = Registry(kind="executor", rows=targets_of("executors"))
 EXPORTERS: Registry[Exporter[Any]] = Registry(kind="format", rows=targets_of("exporters"))
 FILE_CHECKS: Registry[Check] = Registry(kind="check", rows=targets_of("file_checks"))
 LISTS: Registry[Callable[[], Any]] = Registry(kind="list", rows=targets_of("lists"))

@@ -29,6 +29,10 @@ TIME_LIMIT = "time_limit"
 
 NO_IMAGE = -1
 """Image number of a frame without an image."""
+MAX_STAMP_NS = 2**31 * 1_000_000_000 - 1
+"""Maximum timestamp, ns: its seconds have 31 bits in ROS messages."""
+MAX_SUBTASK = 1000
+"""Maximum length of a subtask, characters."""
 
 Vector = NDArray[np.float32] | NDArray[np.float64]
 

@@ -59,8 +59,8 @@ NEAR = 0.02
 a twentieth of a standard deviation of the plain offset, which a policy learns last."""
 
 _POSITION = ("x", "y", "z")
-_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
-_TCP_NAMES = tuple(f"tcp.{axis}" for axis in _POSE)
+POSE_ELEMENTS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+_TCP_NAMES = tuple(f"tcp.{axis}" for axis in POSE_ELEMENTS)
 
 
 _Columns = Iterator[tuple[tuple[str, ...], Array]]
@@ -192,7 +192,7 @@ def _environment(rows: Observations, robot: RobotSpec, scene: Scene) -> _Columns
             yield _yaw_names(f"{from_object}.yaw", n), _difference(yaw, _yaw(object_, n))
     yield from _velocities(rows, robot)
     for body in scene.movable:
-        yield tuple(f"{body.name}.pose.{axis}" for axis in _POSE), poses[body.name]
+        yield tuple(f"{body.name}.pose.{axis}" for axis in POSE_ELEMENTS), poses[body.name]
 
 
 def _placed(label: str, pose: Array, extents: tuple[float, float, float], tcp: Array) -> _Columns:

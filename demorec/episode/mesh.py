@@ -32,7 +32,7 @@ class SolidMesh:
     points: Array  # (V, 3) metres
     faces: NDArray[np.int64]  # (F, 3) rows of `points`, counter-clockwise from outside
     # Rows of `points`; the hull of each is one convex part of the solid in physics. Empty for a mesh just read from a
-    # file: `demorec.sim.solids` finds them.
+    # file.
     parts: tuple[NDArray[np.int64], ...]
 
     @property

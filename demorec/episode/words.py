@@ -8,8 +8,12 @@ COLOR_WORDS = ("red", "green", "blue", "yellow", "orange", "purple", "black", "w
 """Words for colours in instructions and names."""
 VESSELS = ("tray", "bowl")
 """Nouns of containers, which take "in" and "into" instead of "on" and "onto"."""
-_NOUNS = {"jenga": "wooden plank", "lego": "toy brick"}
-"""Nouns for objects with less descriptive names."""
+NOUNS = {
+    **{noun: noun for noun in ("cube", "block", "cylinder", "duck", "mug")},
+    "jenga": "wooden plank",
+    "lego": "toy brick",
+}
+"""Word in a body's name -> its noun in instructions."""
 _SYNONYMS = {
     "target": ("target", "mark", "square"),
     "mark": ("mark", "target", "square"),
@@ -20,7 +24,7 @@ _SYNONYMS = {
 def nouns_of(body: Body) -> tuple[str, ...]:
     """Return the nouns for a body, the usual one first: from its name, less colour and number, and from its shape."""
     words = [word for word in body.name.split("_") if not word.isdigit() and word not in (*COLOR_WORDS, "other")]
-    noun = " ".join(_NOUNS.get(word, word) for word in words) or "object"
+    noun = " ".join(NOUNS.get(word, word) for word in words) or "object"
     nouns = _SYNONYMS.get(noun, (noun,))
     x, y, z = body.shape.extents
     if body.movable and body.shape.kind == "box":

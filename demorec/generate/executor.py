@@ -1,4 +1,4 @@
-"""Executors run attempts in other processes; the driver is the same for one machine and a cluster (`on_ray`).
+"""Executors run attempts in other processes; the driver is the same for one machine and a cluster.
 
 The workers of this machine are spawned processes with one pipe each, so that killing one cannot harm the others: a
 shared queue (multiprocessing.Queue, ProcessPoolExecutor) has locks that a killed worker never releases; with a separate

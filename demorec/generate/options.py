@@ -7,13 +7,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.options import Rare
 from demorec.core.replacing import OptionalTarget
+from demorec.core.tables import EXECUTORS
 from demorec.datasets.lerobot.options import check_repo_id
 from demorec.runs.run_file import MAX_EPISODES, Attempt, GeneratedRun
+
+if TYPE_CHECKING:
+    ExecutorName = str
+else:
+    ExecutorName = Literal["local", *EXECUTORS.names()]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,13 +31,13 @@ class RunOptions:
     num_episodes: int = 50
     """Number of successful episodes to make; a larger one extends the run."""
     workers: int | None = None
-    """Number of simulating processes (auto: one per core; with Ray, as many as the cluster has room for)."""
-    executor: Literal["local", "ray"] = "local"
-    """Processes on this machine, or tasks on a Ray cluster."""
+    """Number of simulating processes (auto: one per core; on a cluster, as many as it has room for)."""
+    executor: ExecutorName = "local"
+    """Processes on this machine, or tasks on a cluster."""
     address: Rare[str] = "local"
-    """Ray: address of the cluster, such as auto (that of this machine) or HOST:6379; local: only this machine."""
+    """Address of the cluster, such as auto (that of this machine) or HOST:6379; local: only this machine."""
     gpus_per_worker: Rare[float] = 0.0
-    """Ray: GPUs that each worker reserves (for --renderer egl)."""
+    """GPUs that each worker on a cluster reserves (for --renderer egl)."""
     recycle_after: Rare[int] = 500
     """Replace a worker process after this many episodes."""
     export: Rare[bool] = True
@@ -49,8 +55,10 @@ class RunOptions:
         check_option("gpus_per_worker", self.gpus_per_worker, 0, 64)
         for name in ("address", "gpus_per_worker"):
             if self.executor == "local" and getattr(self, name) != getattr(RunOptions, name):
-                flag = f"--{name.replace('_', '-')}"
-                raise ConfigError(f"{flag} is for Ray: add --executor ray, or leave it out.")
+                names = EXECUTORS.names()
+                whose = " or ".join(map(str.capitalize, names)) or "a cluster"
+                remedy = f"add --executor {' or '.join(names)}, or leave" if names else "leave"
+                raise ConfigError(f"--{name.replace('_', '-')} is for {whose}: {remedy} it out.")
         if self.repo_id is not None:
             check_repo_id(self.repo_id)
             if not self.export:

@@ -11,7 +11,7 @@ import os
 import signal
 import time
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -20,7 +20,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError
 from demorec.core.processes import available_cores, handled
 from demorec.core.registry import split_name
-from demorec.core.tables import RENDERERS, load_robot
+from demorec.core.tables import EXECUTORS, RENDERERS, load_robot
 from demorec.generate.contents import Inspector
 from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, LocalExecutor, Made, Raised, Report
 from demorec.generate.folder import RunFolder, open_run
@@ -61,28 +61,29 @@ def generate(
         episodes: Order in which episodes are begun (default: ascending); the result does not depend on it.
 
     Raises:
-        MissingDependencyError: Ray is not installed.
-        ConfigError: The task cannot be loaded, the robot does not fit its URDF, the Ray cluster cannot be reached,
-            or the folder is in use, contains another run or is not writable.
+        MissingDependencyError: The executor's package is not installed.
+        ConfigError: The task cannot be loaded, the robot does not fit its URDF, the cluster cannot be reached, or the
+            folder is in use, contains another run or is not writable.
         GenerationError: The run cannot continue; everything finished is kept.
         KeyboardInterrupt: At the second Ctrl-C.
     """
     progress = progress or RunObserver()
     _check_code(config)
     with ExitStack() as stack:
-        if options.executor == "ray":
-            from demorec.generate.on_ray import connected
-
-            stack.enter_context(connected(options.address, options.workers))  # before anything is written
+        connected: Callable[[str, Path], Executor] | None = None
+        if options.executor != "local":
+            connected = stack.enter_context(EXECUTORS.load(options.executor)(options))  # before anything is written
         folder = stack.enter_context(open_run(config, options, progress=progress, inspect=inspect))
         schedule = Schedule(folder.run, episodes=episodes)
         first = schedule.take()
         if first is None:
             return folder.result(interrupted=False)
         schedule.give_back(first)
-        if config.cameras and options.executor != "ray":
+        if config.cameras and connected is None:
             RENDERERS.load(config.renderer)().close()  # compiles the renderer before several processes would
-        executor = stack.enter_context(make_executor(options, folder.path, folder.run, maker))
+        executor = stack.enter_context(
+            connected(maker, folder.path) if connected else make_executor(options, folder.path, folder.run, maker)
+        )
         progress.started(folder.run)
         try:
             interrupted = _Driver(folder, schedule, executor, progress).work()
@@ -112,11 +113,7 @@ def _check_code(config: GenerateConfig) -> None:
 
 
 def make_executor(options: RunOptions, folder: Path, run: GeneratedRun, maker: str) -> Executor:
-    """Create the executor named by the options; a context manager."""
-    if options.executor == "ray":
-        from demorec.generate.on_ray import RayExecutor
-
-        return RayExecutor(maker, folder, options)
+    """Create the executor on this machine; a context manager."""
     missing = run.num_episodes - len(run.successes)
     workers = max(1, min(options.workers or available_cores(), missing))
     return LocalExecutor(maker, folder, workers=workers, recycle_after=options.recycle_after)

@@ -5,23 +5,15 @@ with open_recording(path) as recording:
     recording.images("front")      # decoded images
 """
 
-from demorec.mcap.images import PixelStatistics
 from demorec.mcap.recording import Recording, open_recording, open_simulated
-from demorec.mcap.recover import Recovered, is_whole, recover
-from demorec.mcap.sampled_writer import SampledWriter
 from demorec.mcap.simulated_writer import EpisodeWriter
 from demorec.mcap.video import VideoPacket, VideoSettings
 
 __all__ = [
     "EpisodeWriter",
-    "PixelStatistics",
     "Recording",
-    "Recovered",
-    "SampledWriter",
     "VideoPacket",
     "VideoSettings",
-    "is_whole",
     "open_recording",
     "open_simulated",
-    "recover",
 ]

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from demorec.core.errors import MissingDependencyError
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action, Event, Frame, JointSample, Observation, Table, Trajectory
+from demorec.episode.features import POSE_ELEMENTS
 from demorec.episode.info import EpisodeInfo
 
 if TYPE_CHECKING:
     import pandas as pd
-
-_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def pose_of(row: Array) -> Pose:
@@ -116,9 +115,9 @@ def _trajectory_columns(info: EpisodeInfo, trajectory: Trajectory) -> dict[str, 
                 table |= _components(quantity, rows, info.sensors[quantity].names)
         elif isinstance(value, Mapping):
             for key, poses in value.items():
-                table |= _components(f"{name}.{key}", poses, _POSE)
+                table |= _components(f"{name}.{key}", poses, POSE_ELEMENTS)
         elif np.ndim(value) == 2:
-            table |= _components(name, value, parts.get(name, _POSE))
+            table |= _components(name, value, parts.get(name, POSE_ELEMENTS))
         else:
             table[name] = value
     return table

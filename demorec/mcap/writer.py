@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from heapq import merge
 from itertools import takewhile
@@ -16,24 +17,27 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.records import Metadata
 from numpy.typing import ArrayLike, NDArray
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
-from demorec.core.files import Closing
+from demorec.core.files import MCAP_MAGIC, Closing, open_regular
 from demorec.core.geometry import Array
 from demorec.episode.episode import Frame, Outcome, SampledFrame
-from demorec.episode.info import EpisodeInfo
+from demorec.episode.info import EpisodeInfo, Origin
 from demorec.episode.simulated import scene_of
 from demorec.episode.validity import find_problems
 from demorec.mcap import messages, metadata
 from demorec.mcap.cdr import encode
 from demorec.mcap.channels import LABELS, TF, TF_STATIC, Message, camera_topic, description_topic
+from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.description import body_description, robot_description
 from demorec.mcap.images import CameraWriter
 from demorec.mcap.lossless import segment_names, to_labels
 from demorec.mcap.part_file import PartFile
-from demorec.mcap.recover import can_be_made_again
+from demorec.mcap.scan import RECORD_HEAD, read_record
 from demorec.mcap.streams import FrameStream, frame_streams
 from demorec.mcap.transforms import FrameTree, camera_frame
 
@@ -91,7 +95,7 @@ class BatchWriter(Closing, ABC):
         self._is_described = False
         self._streams = frame_streams(info)
         self._tree = self._prepare(info)
-        self._file = PartFile(path, overwrite=overwrite, is_worthless=partial(can_be_made_again, origin=info.origin))
+        self._file = PartFile(path, overwrite=overwrite, is_worthless=partial(_can_be_made_again, origin=info.origin))
 
     @abstractmethod
     def _prepare(self, info: EpisodeInfo) -> FrameTree | None:
@@ -222,6 +226,25 @@ class BatchWriter(Closing, ABC):
     def discard(self) -> None:
         """Abandon the episode and remove its file."""
         self._file.discard()
+
+
+def _can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
+    """Check whether an unfinished recording is still empty, or was derived from the given origin."""
+    with open_regular(part) as file, suppress(RecordingError), damage_as_recording_error(part):
+        size = file.seek(0, 2)
+        file.seek(len(MCAP_MAGIC))
+        while len(head := file.read(RECORD_HEAD.size)) == RECORD_HEAD.size:
+            opcode, length = RECORD_HEAD.unpack(head)
+            if opcode == Opcode.DATA_END:
+                break
+            if opcode not in (Opcode.HEADER, Opcode.METADATA) or length > size - file.tell():
+                return False
+            content = file.read(length)
+            if opcode == Opcode.METADATA:
+                info, _, _ = metadata.read_episode_metadata(read_record(content, Metadata).metadata)
+                return info.origin == origin and origin not in ("", Origin())
+        return True  # the writer ended before the first frame
+    return False
 
 
 def _latched_messages(info: EpisodeInfo, tree: FrameTree | None, *, has_labels: bool) -> Iterator[Message]:

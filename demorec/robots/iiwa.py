@@ -4,8 +4,6 @@ Position, velocity and torque limits are the manufacturer's (data sheet of the L
 acceleration limits: these are moderate ones, similar to the Panda's.
 """
 
-from __future__ import annotations
-
 import math
 
 from demorec.robots.robot import ParallelGripper, RobotSpec

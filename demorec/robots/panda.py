@@ -3,8 +3,6 @@
 Limits are the manufacturer's (the URDF's position limits are wider than the real ones).
 """
 
-from __future__ import annotations
-
 import math
 
 from demorec.robots.robot import ParallelGripper, RobotSpec

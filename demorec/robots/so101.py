@@ -6,8 +6,6 @@ with a tenth of that torque: 2.7 N at its tip hold any object that fits. Its mot
 Menagerie's model) is reduced to the value that its contacts need.
 """
 
-from __future__ import annotations
-
 import math
 
 from demorec.robots.motors import RealArm

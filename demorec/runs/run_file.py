@@ -24,7 +24,7 @@ RUN_FORMAT = 1
 MAX_EPISODES = 10_000_000
 EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dataset"
 _EXTERNAL = "collected"
-"""The "kind" in run.json for external episodes; see `demorec.runs.external`."""
+"""The "kind" in run.json for external episodes."""
 IMPORT_NAME = "import.json"
 """File next to run.json with the sources and findings of `demorec import`
 (`demorec.extensions.imports.import_file`).

@@ -1,1 +1,1 @@
-"""Robot tasks: families of tasks, one file each, rows in `demorec.core.tables.TASKS`."""
+"""Robot tasks: their common parts and the first one; rows in `demorec.core.tables.TASKS`."""

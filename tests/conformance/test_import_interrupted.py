@@ -11,7 +11,7 @@ from support import bag_mappings, bags
 from support.commands import exit_code
 from support.export import export, make_run
 
-from demorec.mcap.sampled_writer import SampledWriter
+from demorec.extensions.recorder.sampled_writer import SampledWriter
 
 pytestmark = pytest.mark.slow
 

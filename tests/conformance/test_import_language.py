@@ -17,7 +17,9 @@ from support.external import make_external, write_external
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.errors import ConfigError
-from demorec.mcap import Recording, SampledWriter, recover
+from demorec.extensions.recorder.sampled_writer import SampledWriter
+from demorec.extensions.recovery.recover import recover
+from demorec.mcap import Recording
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 SAID = {12: "grasp the cup", 30: "lift the cup", 41: "put it down"}

@@ -18,7 +18,7 @@ from demorec.extensions.imports.bag import Bag, open_bag
 from demorec.extensions.imports.bag_files import BagError
 from demorec.extensions.imports.decoding import UnknownEncodingError, decode_message
 from demorec.extensions.imports.fields import stamp_of
-from demorec.mcap.scan import ScannedChannel, ScannedMessage
+from demorec.extensions.recovery.scan import ScannedChannel, ScannedMessage
 
 
 def _read(bag: Bag) -> tuple[list[tuple[str, int, dict[str, Any]]], list[str]]:

@@ -23,9 +23,9 @@ from demorec.core.tables import TASKS
 from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
-from demorec.episode.words import nouns_of
+from demorec.episode.words import NOUNS, nouns_of
+from demorec.extensions.tasks.pick import THINGS
 from demorec.mcap import Recording
-from demorec.tasks.furniture import THINGS
 
 RECIPE = Path(__file__).parents[2] / "examples" / "language_recipe.yaml"
 MISSING = ("pick_place", "stack", "sort_by_color")
@@ -242,7 +242,7 @@ def test_objects_have_the_names_of_the_instructions(kind: str) -> None:
     shape = Shape(kind="mesh", size=(0.03, 0.03, 0.03))
     for name in (kind, f"red_{kind}", f"other_red_{kind}", f"red_{kind}_2"):
         body = Body(name=name, role="object", shape=shape, world_from_body=Pose(), mass=0.1)
-        assert nouns_of(body)[0] == THINGS[kind].noun
+        assert nouns_of(body)[0] == NOUNS[kind]
 
 
 def stages_of(run: Path) -> tuple[int, list[StageRun]]:

@@ -16,7 +16,8 @@ from support.commands import exit_code
 
 from demorec.core.config import VideoConfig
 from demorec.core.tables import FILE_CHECKS
-from demorec.mcap import channels, recover
+from demorec.extensions.recovery.recover import recover
+from demorec.mcap import channels
 
 Fault = Callable[[Spoilt], None]
 Rows = np.ndarray[Any, Any]

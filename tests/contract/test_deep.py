@@ -15,13 +15,14 @@ from support.mcap import rewritten
 
 from demorec.cli.generate_report import check_run
 from demorec.core.plain import to_plain
+from demorec.extensions.recovery.recover import recover
 from demorec.extensions.remake.byte_comparison import Contents, content_differences
 from demorec.extensions.remake.deep_check import DeepReport, deep_check, deep_checks
 from demorec.extensions.remake.options import RerenderOptions
 from demorec.extensions.remake.rerender import rerender
 from demorec.generate.options import RunResult
 from demorec.loop import SimulatorCache
-from demorec.mcap import Recording, recover
+from demorec.mcap import Recording
 from demorec.mcap.metadata import EPISODE, OUTCOME
 from demorec.runs.run_file import load_run_file
 

@@ -15,8 +15,8 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
 from demorec.core.tables import EXPORTERS
+from demorec.extensions.recovery.recover import recover
 from demorec.mcap import EpisodeWriter, Recording
-from demorec.mcap.recover import recover
 from demorec.runs.find import find, name_of
 
 ON_REQUEST = ("observation.effort", "observation.contact_force", "observation.wrench")

@@ -25,14 +25,15 @@ BROKEN = {
     "missing": ("OTHER = 1", "AttributeError"),
     "other kind": ("EXTENSION = 1", "is not a demorec.core.extension.Extension"),
     "clash": (
-        f"{IMPORT}\nEXTENSION = Extension(name='x', summary='', tasks={{'stack': 'nowhere:Stack'}})",
-        "core has tasks with the same name: stack",
+        f"{IMPORT}\nEXTENSION = Extension(name='x', summary='', tasks={{'pick_place': 'nowhere:Pick'}})",
+        "core has tasks with the same name: pick_place",
     ),
     "needs": (
         f"{IMPORT}\nEXTENSION = Extension(name='z', summary='', needs=('y',))",
         "it needs y",
     ),
 }
+GENERATE = "generate_dataset_main"
 OWN = [extension.name for extension in extensions().found if extension.name != "core"]
 
 
@@ -100,7 +101,7 @@ def run(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("made") / "run"
     words = ["--task", "lab_pick", "--robot", "lab_panda", "--cameras", "corner", "--width", 64, "--height", 64]
     told = demorec(
-        site, *words, "--num-episodes", 1, "--workers", 1, "--no-export", "--out", out, program="generate_dataset_main"
+        site, *words, "--executor", "bench", "--num-episodes", 1, "--no-export", "--out", out, program=GENERATE
     )
     assert "none failed" in told
     assert "1 episode generated again and compared" in told
@@ -111,10 +112,10 @@ def test_lists_and_help_show_the_names_of_a_package(site: Path) -> None:
     names = {"tasks": "lab_pick", "robots": "lab_panda", "cameras": "corner", "exporters": "labcsv",
              "checks": "late_start", "extensions": "lab"}  # fmt: skip
     calls = [*(["list", table] for table in names), ["--help"], ["import", "--help"], ["explain", "late_start"]]
-    told = several(site, *calls)
+    told = several(site, *calls, ["generate", "--help"])
     for name in names.values():
         assert f"\n{name} " in f"\n{told}", name
-    for words in ("count-frames", "labcsv (CSV", "A policy learns to wait."):
+    for words in ("count-frames", "bench", "labcsv (CSV", "A policy learns to wait."):
         assert words in told
 
 
@@ -204,5 +205,5 @@ def test_a_folder_can_be_deleted(name: str, tmp_path: Path) -> None:
     assert not listed & set(commands)
     out = tmp_path / "run"
     words = ["--num-episodes", 1, "--cameras", "none", "--workers", 1, "--no-export", "--out", out]
-    assert "none failed" in demorec(tmp_path, *words, program="generate_dataset_main")
+    assert "none failed" in demorec(tmp_path, *words, program=GENERATE)
     assert "pick_place" in demorec(tmp_path, "info", out)

@@ -18,7 +18,7 @@ from support.generate import inspect, num_finished
 
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError
-from demorec.generate import on_ray
+from demorec.extensions.ray import on_ray
 from demorec.generate.options import RunOptions, RunResult
 from demorec.generate.run import generate
 from demorec.runs.run_file import load_run_file

@@ -15,7 +15,8 @@ from support.recording import write_episode
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
 from demorec.episode.info import FORMAT_VERSION
-from demorec.mcap import Recording, recover
+from demorec.extensions.recovery.recover import recover
+from demorec.mcap import Recording
 
 Damage = Callable[[bytes, random.Random], bytes]
 

@@ -22,7 +22,8 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
 from demorec.episode.episode import Frame
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap import EpisodeWriter, Recording, recover
+from demorec.extensions.recovery.recover import recover
+from demorec.mcap import EpisodeWriter, Recording
 
 FPS = 30
 MOST_FRAMES = 300

@@ -53,7 +53,7 @@ def test_a_refused_request_writes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refuse: Callable[[Path], object], there: str
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)  # not installed
-    monkeypatch.delitem(sys.modules, "demorec.generate.on_ray", raising=False)
+    monkeypatch.delitem(sys.modules, "demorec.extensions.ray.on_ray", raising=False)
     out = tmp_path / "out"
     if there == "a run":
         run_fake(out, num_episodes=1)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from demorec.core.config import VideoConfig
 from demorec.episode.episode import Outcome, Sample, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin
-from demorec.mcap import SampledWriter
+from demorec.extensions.recorder.sampled_writer import SampledWriter
 
 URDF = """<robot name="two_joints">
  <link name="base"><visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual></link>

@@ -120,7 +120,7 @@ def test_episodes_of_other_kinds_do_not_mix(tmp_path: Path) -> None:
 def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
     from typing import cast
 
-    from demorec.mcap import SampledWriter
+    from demorec.extensions.recorder.sampled_writer import SampledWriter
 
     context = cast(av.VideoCodecContext, av.CodecContext.create("libx265", "w"))
     context.width, context.height, context.pix_fmt, context.time_base = 64, 48, "yuv420p", Fraction(1, 30)

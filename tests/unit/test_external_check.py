@@ -15,7 +15,7 @@ from support.commands import exit_code
 from support.external import FORCE, TOP, Episode, make_external, write_external
 
 from demorec.episode.episode import Sample, SampledFrame
-from demorec.runs.external import episode_path, open_external_run
+from demorec.extensions.recorder.external_run import episode_path, open_external_run
 
 CAMERAS = (TOP, replace(TOP, name="side"))
 

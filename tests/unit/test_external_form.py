@@ -15,7 +15,7 @@ from support.external import (
 
 from demorec.core.errors import ConfigError
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap import SampledWriter
+from demorec.extensions.recorder.sampled_writer import SampledWriter
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ import importlib, pkgutil, sys
 sys.modules.update(dict.fromkeys({ABSENT!r}))
 import demorec
 for module in pkgutil.walk_packages(demorec.__path__, "demorec."):
-    if module.name != "demorec.generate.on_ray":
+    if module.name != "demorec.extensions.ray.on_ray":
         importlib.import_module(module.name)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300)

@@ -14,11 +14,11 @@ from support.sim import episode, run
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.tables import OBJECTS, ROBOTS
 from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
+from demorec.extensions.tasks.solid_physics import at_rest, with_parts
 from demorec.loop import ScriptAgent, Session, make_world
 from demorec.objects.antipodal import antipodal_grasps
 from demorec.objects.folder import load_shelf, read_solid
 from demorec.objects.shelf import Kind
-from demorec.sim.solids import at_rest, with_parts
 
 pytestmark = pytest.mark.slow
 

@@ -18,8 +18,8 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import NO_IMAGE
 from demorec.episode.info import Camera, Feature
+from demorec.extensions.recorder.encoder import BackgroundEncoder
 from demorec.mcap import Recording
-from demorec.mcap.recorder.encoder import BackgroundEncoder
 from demorec.robots.panda import PANDA
 from demorec.runs.run_file import load_any_run_file
 

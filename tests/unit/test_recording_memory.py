@@ -14,7 +14,8 @@ from support.external import TOP, make_external
 from support.recording import make_episode
 
 from demorec.episode.episode import frame_time_ns
-from demorec.mcap import EpisodeWriter, Recording, SampledWriter
+from demorec.extensions.recorder.sampled_writer import SampledWriter
+from demorec.mcap import EpisodeWriter, Recording
 
 READERS: dict[str, Callable[[Recording], Iterable[object]]] = {
     "packets": lambda recording: recording.packets("front"),

@@ -13,7 +13,8 @@ from support.recording import make_episode
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import Frame, Outcome
-from demorec.mcap import EpisodeWriter, Recording, recover
+from demorec.extensions.recovery.recover import recover
+from demorec.mcap import EpisodeWriter, Recording
 
 
 def names(folder: Path) -> list[str]:

@@ -19,12 +19,11 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.videos import EpisodeVideo
-from demorec.episode.episode import Outcome, Table
+from demorec.episode.episode import MAX_STAMP_NS, MAX_SUBTASK, Outcome, Table
 from demorec.episode.features import DEPTH_SUFFIX
 from demorec.episode.info import Camera, EpisodeInfo, Origin
 from demorec.episode.protocol import Episode, SceneMotion
 from demorec.episode.roles import Roles
-from demorec.mcap.sampled_writer import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.streams import frame_times
 from demorec.mcap.transforms import measured_motion
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded

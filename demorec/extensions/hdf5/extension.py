@@ -1,7 +1,5 @@
 """Declaration of the export to HDF5."""
 
-from __future__ import annotations
-
 from demorec.core.extension import ExporterRow, Extension
 
 EXTENSION = Extension(

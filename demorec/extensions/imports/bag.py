@@ -29,7 +29,7 @@ from demorec.extensions.imports.bag_files import (
     read_sqlite,
 )
 from demorec.extensions.imports.words import in_natural_order
-from demorec.mcap.scan import ScannedMessage
+from demorec.extensions.recovery.scan import ScannedMessage
 from demorec.runs.find import BAG_SUFFIXES, NOT_UTF8, ROS1_MAGIC, ROSBAG2, SQLITE_MAGIC, find, import_word, name_of
 
 NS = 1_000_000_000

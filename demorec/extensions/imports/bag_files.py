@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from demorec.core.errors import DemorecError, describe_error
 from demorec.core.files import MCAP_MAGIC, open_regular
-from demorec.mcap.scan import CutOffError, ScannedChannel, ScannedMessage, scan
+from demorec.extensions.recovery.scan import CutOffError, ScannedChannel, ScannedMessage, scan
 
 MAX_TIME_NS = 1 << 62
 """Maximum time of a message, in the year 2116: the difference of two fits 64 bits."""

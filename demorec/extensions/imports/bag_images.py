@@ -16,8 +16,8 @@ from demorec.extensions.imports.fields import image_bytes
 from demorec.extensions.imports.image_messages import decode_image
 from demorec.extensions.imports.planning import ImportSettings, PlannedBag
 from demorec.extensions.imports.rows import EpisodeRows
+from demorec.extensions.recorder.external_run import external_line
 from demorec.mcap.cdr import Values
-from demorec.runs.external import external_line
 from demorec.runs.run_file import Attempt
 
 

@@ -30,9 +30,9 @@ from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.extensions.imports.description import importing_versions
 from demorec.extensions.imports.episode_writer import FramesImport, Image, add_episode
+from demorec.extensions.recorder.external_run import ExternalFolder, episode_path, open_external_run, planned_episode
 from demorec.mcap.video import deep_gray
 from demorec.robots.motors import Motors
-from demorec.runs.external import ExternalFolder, episode_path, open_external_run, planned_episode
 from demorec.runs.find import expect
 
 _MAX_EXACT = 2**53

@@ -20,9 +20,9 @@ from rosbags.typesys.msg import MSGParser
 
 from demorec.core.errors import describe_error
 from demorec.core.plain import MAX_DEPTH, parse_json
+from demorec.extensions.recovery.scan import ScannedChannel, ScannedMessage
 from demorec.mcap.cdr import Readers, Values, read_whole
 from demorec.mcap.ros2 import FieldType, Types
-from demorec.mcap.scan import ScannedChannel, ScannedMessage
 
 Decoder = Callable[[bytes], Values]
 """Converts a message's bytes to values; ValueError if they do not fit its type."""

@@ -18,7 +18,7 @@ from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin, SourceFil
 from demorec.extensions.imports.fields import FieldError
 from demorec.extensions.imports.mapping import SourceMapping
 from demorec.robots.assets import remember_model
-from demorec.robots.urdf import Urdf
+from demorec.robots.urdf import MAX_BYTES, Urdf
 
 
 @cache
@@ -76,16 +76,13 @@ def imported_info(
     )
 
 
-_MAX_URDF_BYTES = 4 << 20
-
-
 def urdf_text(mapping: SourceMapping, mapping_path: Path) -> str | None:
     """Read the URDF file that a mapping names; None if it names none. Raises ConfigError if it cannot be read."""
     if not mapping.robot.urdf:
         return None
     path = mapping_path.parent / mapping.robot.urdf
     try:
-        text = read_text_limited(path, _MAX_URDF_BYTES)
+        text = read_text_limited(path, MAX_BYTES)
         remember_model(text, path)
         return text or None
     except (OSError, ValueError) as error:  # not text, or a NUL in the name

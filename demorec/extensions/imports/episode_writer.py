@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from demorec.core.config import VideoConfig
 from demorec.episode.episode import Outcome, Sample, SampledFrame, Table
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap import SampledWriter
-from demorec.runs.external import ExternalFolder, episode_path
+from demorec.extensions.recorder.external_run import ExternalFolder, episode_path
+from demorec.extensions.recorder.sampled_writer import SampledWriter
 
 Image = bytes | NDArray[Any]
 """A passthrough packet, (H, W, 3) uint8 RGB, or (H, W) depth in the form for `SampledWriter.image`."""

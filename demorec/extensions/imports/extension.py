@@ -1,12 +1,11 @@
 """Declaration of the import of bags, HDF5 files and LeRobot datasets."""
 
-from __future__ import annotations
-
 from demorec.core.extension import CommandRow, Extension, ReaderRow
 
 EXTENSION = Extension(
     name="imports",
     summary="convert bags, HDF5 files and LeRobot datasets to runs",
+    needs=("recorder", "recovery"),
     commands={"import": CommandRow(target="demorec.extensions.imports.command:Import", group="make", limits="reading")},
     readers={
         "rosbag": ReaderRow(

@@ -32,8 +32,8 @@ from demorec.extensions.imports.hdf5_file import ForeignFile, Hdf5Error, Scalar,
 from demorec.extensions.imports.mapping import MAX_FPS, Episodes, SourceMapping
 from demorec.extensions.imports.mapping_file import read_mapping
 from demorec.extensions.imports.words import in_natural_order, stated_task
+from demorec.extensions.recorder.external_run import differences, open_external_run, planned_episode
 from demorec.mcap.streams import frame_times
-from demorec.runs.external import differences, open_external_run, planned_episode
 from demorec.runs.find import expect
 
 

@@ -20,7 +20,7 @@ from demorec.extensions.imports.import_file import BagReport, ImportFile, Skippe
 from demorec.extensions.imports.mapping import SourceMapping
 from demorec.extensions.imports.mapping_file import read_mapping
 from demorec.extensions.imports.planning import ImportSettings, PlannedBag, plan_bag
-from demorec.runs.external import ExternalFolder, differences, open_external_run
+from demorec.extensions.recorder.external_run import ExternalFolder, differences, open_external_run
 from demorec.runs.run_file import Attempt
 
 _MAX_REASON = 1000

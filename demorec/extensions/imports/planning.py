@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from demorec.core.config import VideoConfig
+from demorec.episode.episode import MAX_STAMP_NS
 from demorec.episode.info import Camera, EpisodeInfo, Feature, SourceFile
 from demorec.episode.validity import find_problems
 from demorec.extensions.imports.bag import NS, Bag, Files
@@ -22,7 +23,6 @@ from demorec.extensions.imports.mapping import SourceMapping
 from demorec.extensions.imports.rows import EpisodeRows, TakenImages, Timelines
 from demorec.extensions.imports.streams import read_streams
 from demorec.extensions.imports.words import stated_task
-from demorec.mcap.sampled_writer import MAX_STAMP_NS
 from demorec.mcap.video import size_problem
 
 

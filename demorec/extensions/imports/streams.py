@@ -30,8 +30,8 @@ from demorec.extensions.imports.fields import (
 )
 from demorec.extensions.imports.image_messages import ImageHead, image_head
 from demorec.extensions.imports.mapping import CameraSource, Source, SourceMapping, Unit
+from demorec.extensions.recovery.scan import ScannedMessage
 from demorec.mcap.cdr import Values
-from demorec.mcap.scan import ScannedMessage
 
 NO_STAMP = -(2**63)
 Key = tuple[str, int] | str

@@ -24,8 +24,8 @@ from demorec.extensions.imports.fields import FieldError, follow, parse_path, re
 from demorec.extensions.imports.image_messages import ImageHead, NoColorError, image_head
 from demorec.extensions.imports.mapping import MAX_FPS, Clock, Source
 from demorec.extensions.imports.words import quoted, task_in_name, unique_name
+from demorec.extensions.recovery.scan import ScannedMessage
 from demorec.mcap.cdr import Values
-from demorec.mcap.scan import ScannedMessage
 
 _USUAL_FPS = 30
 """Suggested rate of a bag without a stream of known rate."""

@@ -1,7 +1,5 @@
 """Declaration of environments, evaluation and correction."""
 
-from __future__ import annotations
-
 from demorec.core.extension import CommandRow, Extension
 
 EXTENSION = Extension(

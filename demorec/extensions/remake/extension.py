@@ -1,7 +1,5 @@
 """Declaration of deep checks, replay and rendering."""
 
-from __future__ import annotations
-
 from demorec.core.extension import CommandRow, Extension
 
 EXTENSION = Extension(

@@ -22,5 +22,6 @@ EXTENSION = Extension(
     tasks={"lab_pick": "lab_extension.scenes:LabPick"},
     robots={"lab_panda": "lab_extension.scenes:LAB_PANDA"},
     cameras={"corner": "lab_extension.scenes:CORNER"},
+    executors={"bench": "lab_extension.machines:bench"},
     checks={"late_start": "lab_extension.checks:late_start"},
 )

@@ -11,7 +11,7 @@ import logging
 import math
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -150,6 +150,13 @@ def _attempt(maker: str, plan: EpisodePlan, folder: str) -> Report:
             f"nodes share under one path: {folder}"
         )
     return attempt_episode(maker, plan, path)
+
+
+@contextmanager
+def executor_on_ray(options: RunOptions) -> Iterator[Callable[[str, Path], Executor]]:
+    """Connect to the cluster of the options; returns a function that makes an executor there. Errors as `connected`."""
+    with connected(options.address, options.workers):
+        yield lambda maker, folder: RayExecutor(maker, folder, options)
 
 
 @contextmanager

@@ -17,14 +17,14 @@ from mcap.records import Metadata
 from demorec.core.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.core.files import MCAP_MAGIC, make_folder, open_regular
 from demorec.episode.episode import frame_time_ns
-from demorec.episode.info import EpisodeInfo, Origin
+from demorec.episode.info import EpisodeInfo
+from demorec.extensions.recovery.scan import CutOffError, ScannedMessage, scan
 from demorec.mcap import messages, metadata
 from demorec.mcap.channels import TF, camera_topic, video_topic
 from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.ros2 import DEFINITIONS
-from demorec.mcap.scan import CutOffError, ScannedMessage, scan
 from demorec.mcap.streams import frame_streams
 
 _KNOWN_TYPES = {*DEFINITIONS, messages.PROTOBUF_VIDEO}
@@ -93,19 +93,6 @@ def is_whole(source: Path) -> bool:
             return recording.outcome is not None and bool(recording.digest())
     except RecordingError:
         return False
-
-
-def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
-    """Check whether an unfinished recording is still empty, or was derived from the given origin."""
-    for item in _items(part):
-        if isinstance(item, Metadata) and item.name == metadata.EPISODE:
-            info, _, _ = metadata.read_episode_metadata(item.metadata)
-            return info.origin == origin and origin not in ("", Origin())
-        if isinstance(item, str):
-            return item == "the end is missing"  # after nothing: the writer was killed before the first frame
-        if item is not None:
-            return False
-    return True  # it ended properly, before the first frame
 
 
 class _Survey(NamedTuple):

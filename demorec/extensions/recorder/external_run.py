@@ -18,7 +18,8 @@ from demorec.core.files import LOCK_NAME, free_name, make_folder, run_lock
 from demorec.core.plain import plain_differences
 from demorec.core.replacing import RECORDING, json_object
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap import Recording, recover
+from demorec.extensions.recovery.recover import recover
+from demorec.mcap import Recording
 from demorec.runs.recorded import recorded_line
 from demorec.runs.run_file import (
     DATASET,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
 from demorec.core.registry import nearest_match
-from demorec.episode.episode import SampledFrame
+from demorec.episode.episode import MAX_STAMP_NS, MAX_SUBTASK, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo
 from demorec.mcap import messages
 from demorec.mcap.cdr import encode
@@ -73,13 +73,6 @@ class SampledWriter(BatchWriter):
         """See `BatchWriter`."""
         self._write_images({name: camera.num_ready for name, camera in self._cameras.items()})
         self._write_frames()
-
-
-MAX_STAMP_NS = 2**31 * 1_000_000_000 - 1
-"""Maximum timestamp, ns: its seconds have 31 bits in ROS messages."""
-
-MAX_SUBTASK = 1000
-"""Maximum length of a subtask, characters."""
 
 
 class SampledFrameCheck:

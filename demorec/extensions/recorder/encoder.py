@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from demorec.episode.episode import SampledFrame
 from demorec.episode.info import Camera
-from demorec.mcap import SampledWriter
+from demorec.extensions.recorder.sampled_writer import SampledWriter
 
 WhenFull = Literal["error", "drop", "wait"]
 

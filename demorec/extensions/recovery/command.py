@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from tyro.conf import Positional
-
+from demorec.cli.shared.flags import Positional
 from demorec.cli.shared.output import say
 from demorec.core.replacing import OptionalTarget
 from demorec.runs.find import EVALUATION_NAME, expect
@@ -36,7 +35,7 @@ class Recover:
 
     def run(self) -> int:
         """Recover and print how much was kept."""
-        from demorec.mcap import is_whole, recover
+        from demorec.extensions.recovery.recover import is_whole, recover
 
         found = expect(self.file, "recording", "unfinished")
         if found.kind == "recording" and self.out is None and is_whole(self.file):

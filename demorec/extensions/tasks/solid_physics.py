@@ -66,13 +66,12 @@ def _text_with_parts(mesh: SolidMesh) -> str:
 
 def _vhacd(surface: str) -> list[Array]:
     """Find V-HACD's convex parts of an OBJ text; returns the points of each, rounded to the stored precision."""
-    import pybullet
-
     with tempfile.TemporaryDirectory(prefix="demorec_") as folder:
         source, target, log = (Path(folder) / name for name in ("mesh.obj", "parts.obj", "log.txt"))
         source.write_text(surface)
+        client = connect()
         with silence():
-            pybullet.vhacd(
+            client.vhacd(
                 str(source), str(target), str(log), resolution=50_000, concavity=0.0025, maxNumVerticesPerCH=32
             )
         lines = target.read_text().splitlines()

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from demorec.episode.mesh import SolidMesh
+from demorec.extensions.tasks.solids import arc, board, joined, lathe, rod
 from demorec.objects.shelf import Shelf, drawn
-from demorec.objects.solids import arc, board, joined, lathe, rod
 
 Rng = np.random.Generator
 BLOCK_SHAPES = 25

@@ -13,16 +13,18 @@ from demorec.core.geometry import Pose
 from demorec.episode.mesh import decode_mesh, encode_mesh
 from demorec.episode.scene import Body, Goal, Rgba, Role, Scene, Shape, Texture
 from demorec.episode.words import VESSELS
+from demorec.extensions.tasks.pick import IN_TRAY, OTHER_COLORS, TRAY_FLOOR, TRAYS, tray
+from demorec.extensions.tasks.solid_physics import ROLLING_FRICTION, at_rest, with_parts
+from demorec.extensions.tasks.solids import dish
 from demorec.objects.shelf import MATERIALS, Kind, Material
-from demorec.objects.solids import dish
 from demorec.robots.robot import RobotSpec
-from demorec.sim.solids import ROLLING_FRICTION, at_rest, with_parts
 from demorec.tasks.base import Layout, TableTask
-from demorec.tasks.furniture import COLORS, OTHER_COLORS, green_target, walls, words_for
+from demorec.tasks.furniture import COLORS, TABLE_HEIGHT, green_target, words_for
 from demorec.tasks.grasping import found_grasps
-from demorec.tasks.pick import IN_TRAY, TRAY_FLOOR, TRAYS, tray
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
 
+WALL_HEIGHT = 1.6
+"""Height of the walls around the table, metres; the sun of `--variation full` is above them."""
 BESIDE_TRAY = Region(x=(0.33, 0.68), y=(-0.30, 0.15))
 EVERYWHERE = Region(x=(0.33, 0.68), y=(-0.30, 0.30))
 HAND = 0.105
@@ -123,6 +125,26 @@ class PickAnything(TableTask):
         name = goal.onto or "green_target"
         place = f"{'in' if name.endswith(VESSELS) else 'on'} the {name.replace('_', ' ')}"
         return wording(rng, *self.wordings, thing=words_for(scene.body(goal.object)), place=place)
+
+
+def walls() -> tuple[Body, ...]:
+    """Make visual-only walls behind the table and on both sides, out of the arm's reach; named "wall..."."""
+    places = {
+        "wall_back": (-1.3, 0.0, 0.0),
+        "wall_left": (0.7, 1.5, -math.pi / 2),
+        "wall_right": (0.7, -1.5, math.pi / 2),
+    }
+    return tuple(
+        Body(
+            name=name,
+            role="fixture",
+            shape=Shape(kind="box", size=(0.02, 4.0, WALL_HEIGHT)),
+            world_from_body=Pose.from_yaw((x, y, WALL_HEIGHT / 2 - TABLE_HEIGHT), yaw),
+            rgba=(0.70, 0.74, 0.76, 1.0),
+            collides=False,
+        )
+        for name, (x, y, yaw) in places.items()
+    )
 
 
 def radius_of(body: Body) -> float:

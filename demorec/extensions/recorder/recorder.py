@@ -22,9 +22,10 @@ from demorec.core.registry import nearest_match
 from demorec.episode.episode import Outcome, Sample, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin
 from demorec.episode.validity import find_problems
-from demorec.mcap import SampledWriter
-from demorec.mcap.recorder.encoder import BackgroundEncoder, WaitingImages, WhenFull
-from demorec.mcap.recorder.vectors import (
+from demorec.extensions.recorder.encoder import BackgroundEncoder, WaitingImages, WhenFull
+from demorec.extensions.recorder.external_run import ExternalFolder, episode_path, open_external_run
+from demorec.extensions.recorder.sampled_writer import SampledFrameCheck, SampledWriter
+from demorec.extensions.recorder.vectors import (
     NamedVectors,
     RobotLike,
     Vectors,
@@ -33,9 +34,7 @@ from demorec.mcap.recorder.vectors import (
     named_vectors,
     robot_facts,
 )
-from demorec.mcap.sampled_writer import SampledFrameCheck
 from demorec.mcap.video import size_problem
-from demorec.runs.external import ExternalFolder, episode_path, open_external_run
 
 Image = NDArray[np.uint8] | tuple[NDArray[np.uint8], int]
 """(H, W, 3) uint8 RGB, alone or with its capture timestamp (ns)."""

@@ -18,7 +18,7 @@ from demorec.core.errors import ConfigError, RecordingError, SceneError, describ
 from demorec.core.files import read_text_limited
 from demorec.core.registry import nearest_match
 from demorec.episode.features import ACTION, STATE
-from demorec.episode.info import Feature
+from demorec.episode.info import OBSERVATION, Feature
 from demorec.mcap.description import robot_description, self_contained
 from demorec.robots.assets import remember_model
 from demorec.robots.robot import RobotSpec
@@ -29,15 +29,13 @@ NamedVectors = Mapping[str, tuple[NDArray[Any], tuple[str, ...]]]
 
 Vectors = ArrayLike | Mapping[str, ArrayLike]
 
-_PREFIX = "observation."
-
 
 def named_vectors(observation: Vectors, action: Vectors | None) -> NamedVectors:
     """Convert and copy the data; RecordingError unless it is vectors of numbers, or one mapping of numbers."""
     found: dict[str, tuple[NDArray[Any], tuple[str, ...]]] = {}
     if isinstance(observation, Mapping) and not _is_of_numbers(observation):
         for key, value in observation.items():
-            name = key if str(key).startswith(_PREFIX) else f"{_PREFIX}{key}"
+            name = key if str(key).startswith(OBSERVATION) else f"{OBSERVATION}{key}"
             found[name] = _vector(name, value), ()
     else:
         found[STATE] = _one_vector(STATE, observation)

@@ -1,0 +1,1 @@
+"""Recovery of recordings that a crash cut off or damaged."""
