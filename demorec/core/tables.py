@@ -29,6 +29,7 @@ CAMERAS: Registry[CameraPreset] = Registry(
 OBJECTS: Registry[Shelf] = Registry(kind="shelf", rows=targets_of("objects"), instance_of="demorec.objects.shelf:Shelf")
 RENDERERS: Registry[type[Renderer]] = Registry(kind="renderer", rows=targets_of("renderers"))
 EXPORTERS: Registry[Exporter[Any]] = Registry(kind="format", rows=targets_of("exporters"))
+EXTRA_FILES: Registry[Any] = Registry(kind="flag", rows=targets_of("extra_files"))
 FILE_CHECKS: Registry[Check] = Registry(kind="check", rows=targets_of("file_checks"))
 LISTS: Registry[Callable[[], Any]] = Registry(kind="list", rows=targets_of("lists"))
 RANKINGS: Registry[Callable[..., Any]] = Registry(kind="ranking", rows=targets_of("rankings"))
