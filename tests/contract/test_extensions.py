@@ -213,14 +213,13 @@ def test_a_folder_can_be_deleted(name: str, tmp_path: Path) -> None:
     assert done.stdout.startswith(str(tmp_path)), done.stderr
     lists = demorec(tmp_path, "list", "extensions").split()
     assert not set(gone) & set(lists)
-    commands = [row for each in extensions().found if each.name in gone for row in each.commands]
+    lost = [each for each in extensions().found if each.name in gone]
+    commands = [row for each in lost for row in each.commands]
     told = demorec(tmp_path, "--help")
     listed = {line.split()[0] for line in told.splitlines() if line.startswith("  ") and line[2] != " "}
     assert "generate" in listed
     assert not listed & set(commands)
-    flags = [
-        f"--{flag.replace('_', '-')}" for each in extensions().found if each.name in gone for flag in each.extra_files
-    ]
+    flags = [f"--{flag.replace('_', '-')}" for each in lost for flag in each.extra_files]
     told = demorec(tmp_path, "export", "lerobot", "--help-all")
     assert "--append" in told
     assert not any(flag in told for flag in flags)
