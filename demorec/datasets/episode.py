@@ -267,8 +267,7 @@ def _refuse_without_scene(options: CommonOptions, recording: Recording) -> None:
     named = {f"action {options.action}": options.action != "joint", f"state {state}": state != "joint"}
     named |= {f"language {kind}": kind != "subtask" for kind in getattr(options, "language", None) or ()}
     # all but the first exist only for LeRobot datasets
-    flags = ("privileged", "intervention", *EXTRA_FILES.names())
-    named |= {name: getattr(options, name, False) for name in flags}
+    named |= {name: getattr(options, name, False) for name in ("privileged", "intervention", *EXTRA_FILES.names())}
     if needs_scene := [name for name, is_wanted in named.items() if is_wanted]:
         raise ConfigError(
             f"{', '.join(needs_scene)} needs the scene of a simulated episode, leave it out: {recording.path}"

@@ -21,9 +21,8 @@ from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.datasets.lerobot.options import KINDS
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
-from demorec.episode.words import nouns_of
 from demorec.extensions.language.progress import StageRun, dense_runs, dense_stages, proportions
-from demorec.extensions.language.referring import place_of
+from demorec.extensions.language.referring import nouns_of, place_of
 from demorec.extensions.language.timeline import episode_timeline
 from demorec.mcap import Recording
 from demorec.tasks.furniture import THINGS

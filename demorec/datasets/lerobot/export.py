@@ -32,9 +32,7 @@ from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, LeftOut, find_recordings, places_of, why_left_out
 from demorec.mcap import open_recording
 
-_STATED_OPTIONS = (
-    "action", "state", "privileged", "features", "include_failures", "episodes", "depth", "motor_units",
-)  # fmt: skip
+_STATED_OPTIONS = ("action", "state", "privileged", "features", "include_failures", "episodes", "depth", "motor_units")
 """Options that decide the content of the episodes; `demorec/export.json` lists them."""
 
 

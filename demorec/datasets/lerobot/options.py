@@ -9,7 +9,6 @@ from pathlib import Path
 from demorec.core.errors import ConfigError, OptionError
 from demorec.core.extension import ExtraFilesRow, rows_of
 from demorec.core.options import Rare
-from demorec.core.tables import EXTRA_FILES
 from demorec.datasets.options import CommonOptions, Exporter
 from demorec.episode.features import STATE_KINDS, StateKind
 from demorec.robots.motors import MotorUnits
@@ -61,7 +60,7 @@ class ExportOptions(CommonOptions):
     @property
     def extra_files(self) -> tuple[str, ...]:
         """Requested files of extensions, by the name of their flag."""
-        return tuple(name for name in EXTRA_FILES.names() if getattr(self, name, False))
+        return tuple(name for name in _FLAGS if getattr(self, name, False))
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""

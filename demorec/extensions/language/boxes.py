@@ -16,7 +16,7 @@ from demorec.core.errors import ConfigError
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.paths import BOXES_DIR
 from demorec.episode.features import IMAGE_PREFIX
-from demorec.episode.words import nouns_of
+from demorec.extensions.language.referring import nouns_of
 from demorec.mcap import Recording
 
 BoxEntry = tuple[int, str, Mapping[str, Any]]

@@ -43,36 +43,29 @@ class StageRun(NamedTuple):
     last: int
 
 
-class EpisodeStages(NamedTuple):
-    """Stages of an episode of the dataset: those of its rows, and all stages of its task in order."""
-
-    runs: Sequence[StageRun]
-    possible: Sequence[str]
-
-
 class ProgressFile:
     """Writer of the file, which needs the stages of all episodes."""
 
     def __init__(self, root: Path, fps: int) -> None:
         del fps
         self._path = root / PROGRESS_PATH
-        self._episodes: list[EpisodeStages] = []
+        self._episodes: list[tuple[int, list[StageRun]]] = []
 
     @staticmethod
-    def read(episode: ExportEpisode[Any]) -> EpisodeStages:
-        """Return the stages of a simulated episode."""
-        runs = dense_runs(episode_timeline(episode.recording))
-        return EpisodeStages(runs, dense_stages(len(episode.info.simulated.scene.goals), runs))
+    def read(episode: ExportEpisode[Any]) -> tuple[int, list[StageRun]]:
+        """Return the number of goals, and the stages of all rows."""
+        return len(episode.info.simulated.scene.goals), dense_runs(episode_timeline(episode.recording))
 
-    def add(self, stages: EpisodeStages) -> None:
-        """Add the stages of the next episode."""
-        self._episodes.append(stages)
+    def add(self, goals_and_runs: tuple[int, list[StageRun]]) -> None:
+        """Add the next episode."""
+        self._episodes.append(goals_and_runs)
 
     def finish(self) -> None:
         """Write the file of progress for all episodes of a new dataset."""
-        stages = dict.fromkeys(chain.from_iterable(episode.possible for episode in self._episodes))
-        shares = proportions([episode.runs for episode in self._episodes], tuple(stages))
-        parts = [progress(episode.runs, episode.possible, shares) for episode in self._episodes]
+        possible = [dense_stages(num_goals, runs) for num_goals, runs in self._episodes]
+        stages = dict.fromkeys(chain.from_iterable(possible))
+        shares = proportions([runs for _, runs in self._episodes], tuple(stages))
+        parts = [progress(runs, own, shares) for (_, runs), own in zip(self._episodes, possible, strict=True)]
         lengths = [len(part) for part in parts]
         columns = {
             "index": np.arange(sum(lengths)),
@@ -100,9 +93,7 @@ def dense_runs(timeline: EpisodeTimeline) -> list[StageRun]:
     names = [_stage_name(segment) for segment in timeline.segments]
     if not all(names):
         return [StageRun(WHOLE_TASK, 0, timeline.segments[-1].end - 1)]
-    stages: list[str] = []
-    for segment, name in zip(timeline.segments, names, strict=True):
-        stages += [name] * (segment.end - segment.first)
+    stages = np.repeat(names, [segment.end - segment.first for segment in timeline.segments]).tolist()
     return [StageRun(name, first, end - 1) for name, first, end in consecutive_runs(stages)]
 
 

@@ -43,11 +43,6 @@ _RECOVERY = {
 _MIN_MOVE_M = 0.005
 _MIN_OPENING_CHANGE_M = 0.0025
 
-_GoalWords = dict[str, str]
-"""Words of a goal at one moment: "object" ("the red cube") and "place" ("the blue tray", or "its place" if empty).
-
-Its prepositions are "into" ("into", "onto" or "to") and "inside" ("in", "on" or "at")."""
-
 
 def episode_statements(recording: Recording, kinds: Collection[str]) -> list[Statement]:
     """Return the statements of the requested kinds, kind by kind. Raises RecordingError if the recording is damaged."""
@@ -75,8 +70,10 @@ class _Narrator:
             attempt.first: self._goal_words(attempt.goal, attempt.first) for attempt in self._timeline.attempts
         }
 
-    def _goal_words(self, goal_index: int | None, frame: int) -> _GoalWords:
-        """Phrases that distinguish a goal's object and place from all other objects at a frame."""
+    def _goal_words(self, goal_index: int | None, frame: int) -> dict[str, str]:
+        """Return phrases that distinguish a goal's "object" and "place" from all other objects at a frame, and the
+        prepositions "into" ("into", "onto" or "to") and "inside" ("in", "on" or "at").
+        """
         if goal_index is None:
             return {"object": "the object", "place": "its place", "into": "to", "inside": "at"}
         goal = self._scene.goals[goal_index]
