@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.datasets.lerobot.export import export_lerobot
-from demorec.datasets.lerobot.options import ExportOptions
+from demorec.datasets.lerobot.options import LeRobotOptions
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
@@ -52,7 +52,7 @@ def exports(run: Path, work: Path, rounds: int) -> None:
         for name, options in CHOICES.items():
             out = work / f"{name}-{number}"
             start = time.process_time()
-            frames = export_lerobot([run], out, ExportOptions(verify=False, **options)).num_frames
+            frames = export_lerobot([run], out, LeRobotOptions(verify=False, **options)).num_frames
             if number:  # the first round loads libraries
                 seconds[name].append(time.process_time() - start)
             sizes[name] = size_of(out)
@@ -86,7 +86,7 @@ def items(run: Path, work: Path, rounds: int, *, images: bool) -> None:
     readers: dict[tuple[str, str, str], Any] = {}
     for name in names:
         out = work / f"items-{name}-{images}"
-        export_lerobot([run], out, ExportOptions(verify=False, features=features, **CHOICES[name]))
+        export_lerobot([run], out, LeRobotOptions(verify=False, features=features, **CHOICES[name]))
         for decoder in decoders() if images else ["pyav"]:
             for reader in (LeRobotDataset, FastDataset):
                 cache: dict[str, Any] = {} if reader is LeRobotDataset else {"frame_cache_bytes": 0}

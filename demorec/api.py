@@ -25,10 +25,12 @@ if TYPE_CHECKING:
     from demorec.core.extension import CommandRow as CommandRow
     from demorec.core.extension import ExporterRow as ExporterRow
     from demorec.core.extension import Extension as Extension
+    from demorec.core.extension import ExtraFilesRow as ExtraFilesRow
     from demorec.core.extension import ReaderRow as ReaderRow
     from demorec.core.geometry import Pose as Pose
     from demorec.core.replacing import ReplaceableKind as ReplaceableKind
     from demorec.datasets.episode import ExportEpisode as ExportEpisode
+    from demorec.datasets.lerobot.language import Statement as Statement
     from demorec.datasets.options import CommonOptions as CommonOptions
     from demorec.datasets.options import Exporter as Exporter
     from demorec.datasets.options import ExportReport as ExportReport
@@ -148,9 +150,10 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "demorec.extensions.policies.gym_env": ("DemorecEnv", "env_id"),
     },
     "Write an extension": {
-        "demorec.core.extension": ("Extension", "CommandRow", "ExporterRow", "ReaderRow"),
+        "demorec.core.extension": ("Extension", "CommandRow", "ExporterRow", "ExtraFilesRow", "ReaderRow"),
         "demorec.datasets.options": ("Exporter", "CommonOptions", "ExportReport", "ProgressCallback"),
         "demorec.datasets.episode": ("ExportEpisode",),
+        "demorec.datasets.lerobot.language": ("Statement",),
         "demorec.core.atomic": ("atomic_write",),
         "demorec.core.replacing": ("ReplaceableKind",),
         "demorec.check.base": ("check", "Fault", "NotMeasuredError"),

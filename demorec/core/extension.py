@@ -109,6 +109,20 @@ class ExporterRow:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExtraFilesRow:
+    """Files that `demorec export lerobot` adds to a dataset of simulated episodes on request.
+
+    Attributes:
+        target: "module:Class" of (folder of the dataset, fps). Its static method `read` of an `ExportEpisode` may run
+        in another process; `add` takes the results in the order of the episodes, before `finish`.
+        help: Help of the flag.
+    """
+
+    target: str
+    help: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class Extension:
     """Everything an extension adds.
 
@@ -123,6 +137,9 @@ class Extension:
         executors: Name for `--executor` of `generate-dataset` -> context manager of `RunOptions` that connects to other
             machines and returns a function (maker, folder) that makes a `demorec.generate.executor.Executor`.
         exporters: Name -> format for exporting recordings.
+        statements: Kind for `demorec export lerobot --language` -> function (recording, kinds) that returns the
+            `Statement`s of these kinds about a simulated episode.
+        extra_files: Flag of `demorec export lerobot`, with underscores -> files that it adds to the dataset.
         file_checks: Name -> `demorec.check.base.Check` of the integrity of recordings, runs and their datasets.
         checks: Name -> check of any dataset, for the extension that judges datasets.
         operations: Name -> command of `demorec dataset`, for the extension that edits datasets.
@@ -146,6 +163,8 @@ class Extension:
     renderers: Rows = field(default_factory=dict)
     executors: Rows = field(default_factory=dict)
     exporters: Mapping[str, ExporterRow] = field(default_factory=dict)
+    statements: Rows = field(default_factory=dict)
+    extra_files: Mapping[str, ExtraFilesRow] = field(default_factory=dict)
     file_checks: Rows = field(default_factory=dict)
     checks: Rows = field(default_factory=dict)
     operations: Rows = field(default_factory=dict)

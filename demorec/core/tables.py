@@ -30,6 +30,7 @@ OBJECTS: Registry[Shelf] = Registry(kind="shelf", rows=targets_of("objects"), in
 RENDERERS: Registry[type[Renderer]] = Registry(kind="renderer", rows=targets_of("renderers"))
 EXECUTORS: Registry[Callable[..., Any]] = Registry(kind="executor", rows=targets_of("executors"))
 EXPORTERS: Registry[Exporter[Any]] = Registry(kind="format", rows=targets_of("exporters"))
+EXTRA_FILES: Registry[Any] = Registry(kind="flag", rows=targets_of("extra_files"))
 FILE_CHECKS: Registry[Check] = Registry(kind="check", rows=targets_of("file_checks"))
 LISTS: Registry[Callable[[], Any]] = Registry(kind="list", rows=targets_of("lists"))
 RANKINGS: Registry[Callable[..., Any]] = Registry(kind="ranking", rows=targets_of("rankings"))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from demorec.core.errors import ConfigError, ExportError
 from demorec.core.plain import digest
 from demorec.core.registry import nearest_match
+from demorec.core.tables import EXTRA_FILES
 from demorec.datasets.options import CommonOptions
 from demorec.episode.episode import NO_IMAGE, Table, interventions
 from demorec.episode.features import (
@@ -266,7 +267,7 @@ def _refuse_without_scene(options: CommonOptions, recording: Recording) -> None:
     named = {f"action {options.action}": options.action != "joint", f"state {state}": state != "joint"}
     named |= {f"language {kind}": kind != "subtask" for kind in getattr(options, "language", None) or ()}
     # all but the first exist only for LeRobot datasets
-    named |= {name: getattr(options, name, False) for name in ("privileged", "intervention", "progress", "boxes")}
+    named |= {name: getattr(options, name, False) for name in ("privileged", "intervention", *EXTRA_FILES.names())}
     if needs_scene := [name for name, is_wanted in named.items() if is_wanted]:
         raise ConfigError(
             f"{', '.join(needs_scene)} needs the scene of a simulated episode, leave it out: {recording.path}"

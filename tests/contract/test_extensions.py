@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.export import data_table
 
 from demorec.core.extension import extensions
 from demorec.mcap import open_recording
@@ -164,6 +165,21 @@ def test_a_package_brings_a_format_and_a_check(site: Path, run: Path, tmp_path: 
         assert [finding["check"] for finding in json.loads(diagnosis)["findings"]] == ["late_start"] * is_late
 
 
+def test_a_package_brings_language_and_a_file_of_datasets(site: Path, run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    words = ("export", "lerobot", run, "--out", out, "--no-verify", "--language", "motto", "--frame-counts")
+    told = several(site, ("export", "lerobot", "--help-all"), words)
+    assert "task_aug motto)" in " ".join(told.replace("│", " ").split())
+    assert "Write the episodes' lengths." in told
+    (path,) = (run / "episodes").iterdir()
+    with open_recording(path) as recording:
+        num_frames = recording.num_frames
+    assert json.loads((out / "frame_counts.json").read_text()) == [30, num_frames]
+    row = data_table(out).column("language_persistent").to_pylist()[0]
+    expected = ("motto", "tidiness is everything", float(np.float32((num_frames - 1) / 30)))
+    assert [(entry["style"], entry["content"], entry["timestamp"]) for entry in row] == [expected]
+
+
 def test_broken_extensions_are_named_and_harm_nothing(site: Path, tmp_path: Path) -> None:
     shutil.copytree(site, tmp_path / "site")
     for number, (content, _) in enumerate(BROKEN.values()):
@@ -198,11 +214,16 @@ def test_a_folder_can_be_deleted(name: str, tmp_path: Path) -> None:
     assert done.stdout.startswith(str(tmp_path)), done.stderr
     lists = demorec(tmp_path, "list", "extensions").split()
     assert not set(gone) & set(lists)
-    commands = [row for each in extensions().found if each.name in gone for row in each.commands]
+    lost = [each for each in extensions().found if each.name in gone]
+    commands = [row for each in lost for row in each.commands]
     told = demorec(tmp_path, "--help")
     listed = {line.split()[0] for line in told.splitlines() if line.startswith("  ") and line[2] != " "}
     assert "generate" in listed
     assert not listed & set(commands)
+    flags = [f"--{flag.replace('_', '-')}" for each in lost for flag in each.extra_files]
+    told = demorec(tmp_path, "export", "lerobot", "--help-all")
+    assert "--append" in told
+    assert not any(flag in told for flag in flags)
     out = tmp_path / "run"
     words = ["--num-episodes", 1, "--cameras", "none", "--workers", 1, "--no-export", "--out", out]
     assert "none failed" in demorec(tmp_path, *words, program=GENERATE)

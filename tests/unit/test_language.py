@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from support.recording import make_episode
 
-from demorec.annotate.referring import phrase_for, phrases_for, resolve, situation
-from demorec.annotate.statements import episode_statements
 from demorec.core.geometry import Pose
 from demorec.episode.episode import Event
 from demorec.episode.scene import Body, RobotPlacement, Scene, Shape
+from demorec.extensions.language.referring import phrase_for, phrases_for, resolve, situation
+from demorec.extensions.language.statements import episode_statements
 from demorec.mcap import EpisodeWriter, Recording
 
 

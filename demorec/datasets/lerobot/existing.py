@@ -24,8 +24,7 @@ from demorec.datasets.lerobot.layout import (
     TASKS_PATH,
     DatasetInfo,
 )
-from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.datasets.lerobot.progress import PROGRESS_PATH
+from demorec.datasets.lerobot.paths import INFO_PATH, PROGRESS_PATH
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.datasets.lerobot.stats import NAMES, Statistics
 from demorec.datasets.lerobot.writer import DatasetStart

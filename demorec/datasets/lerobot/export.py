@@ -17,6 +17,7 @@ from demorec.core.atomic import atomic_write
 from demorec.core.errors import ConfigError, ExportError, MissingDependencyError, describe_error
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.replacing import shown
+from demorec.core.tables import EXTRA_FILES
 from demorec.datasets.lerobot.card import has_own_card, write_card
 from demorec.datasets.lerobot.existing import features_to_append, link_files, start_after
 from demorec.datasets.lerobot.folder import LeRobotFolder
@@ -25,17 +26,13 @@ from demorec.datasets.lerobot.layout import CODEBASE_VERSION, combined_digest
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, GROWING_DATASET
 from demorec.datasets.lerobot.prepare import NO_PLACE, ExportedEpisode, export_episode, prepare_episode
-from demorec.datasets.lerobot.progress import EpisodeStages, write_progress
 from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, Verifier, lerobot_is_installed
 from demorec.datasets.lerobot.writer import DatasetStart, DatasetWriter
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, LeftOut, find_recordings, places_of, why_left_out
 from demorec.mcap import open_recording
 
-_STATED_OPTIONS = (
-    "action", "state", "privileged", "features", "include_failures", "episodes", "depth", "motor_units", "boxes",
-    "progress",
-)  # fmt: skip
+_STATED_OPTIONS = ("action", "state", "privileged", "features", "include_failures", "episodes", "depth", "motor_units")
 """Options that decide the content of the episodes; `demorec/export.json` lists them."""
 
 
@@ -89,7 +86,6 @@ class _Export:
         self._transcoded: dict[str, None] = {}
         self._digests: dict[Path, str] = {}
         self._has_statements = False
-        self._stages: list[EpisodeStages] = []
         self._intake = Intake(found, options)
 
     def run(self, folder: Path, progress: ProgressCallback | None) -> ExportReport:
@@ -101,19 +97,21 @@ class _Export:
         if begin is None:
             raise self._intake.nothing_to_export()
         _, first = begin  # which decides the features
+        extra = {name: EXTRA_FILES.load(name)(folder, first.info.fps) for name in self._options.extra_files}
         with DatasetWriter(folder, self._start(first)) as writer:
             for path, episode in chain([begin], episodes):
+                for name, files in extra.items():
+                    files.add(episode.extra[name])
                 self._digests[path] = writer.add(episode.data)
                 self._has_statements |= episode.has_statements
                 self._transcoded.update(dict.fromkeys(episode.transcoded))
-                if episode.stages is not None:
-                    self._stages.append(episode.stages)
             self._refuse_duplicates()
             self._refuse_silence()
             stated = {name: getattr(self._options, name) for name in _STATED_OPTIONS}
+            stated |= {name: name in extra for name in EXTRA_FILES.names()}
             finished = writer.finish({"demorec": version("demorec"), **stated, "language": list(self._options.spoken)})
-        if self._options.progress:
-            write_progress(folder, self._stages)
+        for files in extra.values():
+            files.finish()
         write_card(folder, finished, self._options, first.meanings)
         return ExportReport(
             path=folder,

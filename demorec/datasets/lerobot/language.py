@@ -11,16 +11,13 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error
-
-if TYPE_CHECKING:
-    from demorec.annotate import Statement
 
 PERSISTENT, EVENTS = "language_persistent", "language_events"
 COLUMNS = (PERSISTENT, EVENTS)
@@ -42,6 +39,14 @@ REPEATING += (f"{PERSISTENT}.list.element.timestamp",)
 
 _AT_ONCE = 16
 """Number of rows of an episode built in one step."""
+
+
+class Statement(NamedTuple):
+    """One sentence, valid from a row of the episode, counted from 0, until the next one of its kind."""
+
+    row: int
+    kind: str
+    text: str
 
 
 @dataclass(frozen=True, kw_only=True)

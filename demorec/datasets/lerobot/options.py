@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, make_dataclass
 from pathlib import Path
 
-from demorec.annotate import KINDS, LanguageKind
 from demorec.core.errors import ConfigError, OptionError
+from demorec.core.extension import ExtraFilesRow, rows_of
 from demorec.core.options import Rare
 from demorec.datasets.options import CommonOptions, Exporter
 from demorec.episode.features import STATE_KINDS, StateKind
 from demorec.robots.motors import MotorUnits
+
+KINDS = tuple(dict.fromkeys(["subtask", *(kind for kind, _ in rows_of("statements"))]))
+"""Kinds of language: the subtasks that a source specifies, and those that extensions derive."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,15 +33,7 @@ class ExportOptions(CommonOptions):
     calibration: Rare[Path | None] = None
     """With --motor-units: LeRobot's calibration file of your arm (auto: an arm that matches its URDF)."""
     language: tuple[str, ...] | None = None
-    """Add LeRobot's language columns: statements about the robot's actions, derived from the recording. Selected kinds
-    (subtask plan memory motion task_aug), or all that the recordings support.
-    """
-    progress: Rare[bool] = False
-    """Add the progress of each frame (0 to 1), for LeRobot's sample weighting."""
-    boxes: Rare[bool] = False
-    """Write bounding boxes of visible objects next to the dataset, in COCO's format (for recordings with
-    segmentation).
-    """
+    """Add LeRobot's language columns: statements about the robot's actions."""
     repo_id: str = "local/demorec"
     """Name of the dataset on the Hub, OWNER/NAME; also written into its card."""
     append: bool = False
@@ -57,19 +52,24 @@ class ExportOptions(CommonOptions):
     """Licence in the dataset card (auto: apache-2.0 for simulated episodes, none for others)."""
 
     @property
-    def spoken(self) -> tuple[LanguageKind, ...]:
+    def spoken(self) -> tuple[str, ...]:
         """Requested kinds of language."""
         named = self.language
         return () if named is None else tuple(kind for kind in KINDS if not named or kind in named)
+
+    @property
+    def extra_files(self) -> tuple[str, ...]:
+        """Requested files of extensions, by the name of their flag."""
+        return tuple(name for name in _FLAGS if getattr(self, name, False))
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""
         super().validate()
         if self.append and self.overwrite:
             raise ConfigError("--append and --overwrite exclude each other: choose one.")
-        for name in ("boxes", "progress"):
-            if self.append and getattr(self, name):
-                raise ConfigError(f"--{name} is written for a whole dataset: leave out --append and export it again.")
+        for name in self.extra_files if self.append else ():
+            flag = name.replace("_", "-")
+            raise ConfigError(f"--{flag} is written for a whole dataset: leave out --append and export it again.")
         if self.workers < 0:
             raise OptionError("workers", f"is {self.workers}, allowed are 0 (as many as are useful) or more.")
         if self.state not in STATE_KINDS:
@@ -92,8 +92,25 @@ def check_repo_id(repo_id: str) -> None:
         )
 
 
+_FLAGS: dict[str, ExtraFilesRow] = dict(rows_of("extra_files"))
+_HELP = f"""Options of an export to LeRobot, with the flags and kinds of language of extensions.
+
+Attributes:
+    language: Add LeRobot's language columns: statements about the robot's actions, derived from the recording. Selected
+        kinds ({" ".join(KINDS)}), or all that the recordings support.
+""" + "\n".join(f"    {name}: {row.help}" for name, row in _FLAGS.items())
+LeRobotOptions: type[ExportOptions] = make_dataclass(
+    "LeRobotOptions",
+    [(name, Rare[bool], False) for name in _FLAGS],
+    bases=(ExportOptions,),
+    namespace={"__doc__": _HELP},
+    module=__name__,
+    frozen=True,
+    kw_only=True,
+)
+
 LEROBOT = Exporter(
     summary="LeRobot v3.0, a folder: recorded video unchanged, bit-exact numbers, statistics, card",
-    options=ExportOptions,
+    options=LeRobotOptions,
     function="demorec.datasets.lerobot.export:export_lerobot",
 )

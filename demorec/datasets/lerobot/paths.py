@@ -11,6 +11,8 @@ INFO_PATH = "meta/info.json"
 CARD_PATH = "README.md"
 SIDECAR_DIR = "demorec"
 """Folder inside the dataset for data without a place in LeRobot's format."""
+BOXES_DIR = f"{SIDECAR_DIR}/boxes"
+PROGRESS_PATH = "sarm_progress.parquet"
 
 
 def is_dataset(path: Path) -> bool:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
 
-from demorec.annotate import Statement
-from demorec.annotate.boxes import seen_objects
-from demorec.annotate.statements import episode_statements
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
+from demorec.core.extension import rows_of
+from demorec.core.tables import EXTRA_FILES
 from demorec.datasets.episode import DONE, REWARD, SCALARS, SUCCESS, ExportCamera, ExportEpisode
-from demorec.datasets.lerobot.boxes import SeenByCamera
 from demorec.datasets.lerobot.depth import depth_info, depth_video
-from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language, language_arrays
+from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, Statement, episode_language, language_arrays
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     LANGUAGE_FEATURE,
@@ -28,13 +27,12 @@ from demorec.datasets.lerobot.layout import (
 )
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.datasets.lerobot.progress import EpisodeStages, episode_stages
 from demorec.datasets.lerobot.robots import IN_MOTOR_UNITS, motor_features
 from demorec.datasets.lerobot.sidecar import EpisodeRecord
 from demorec.datasets.lerobot.stats import PixelHistogram, Statistics, colour_levels
 from demorec.datasets.lerobot.writer import EpisodeData
 from demorec.episode.episode import Table
-from demorec.episode.features import ACTION, EE_POSE, IMAGE_PREFIX, STATE, VELOCITY
+from demorec.episode.features import ACTION, EE_POSE, STATE, VELOCITY
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import scene_of
 from demorec.mcap import Recording, VideoSettings
@@ -60,7 +58,7 @@ class ExportedEpisode:
         transcoded: Cameras with transcoded images, and the reason.
         has_statements: Whether it has any language.
         meanings: Feature -> its origin or units in the recording.
-        stages: Its stages, for the progress; None unless requested.
+        extra: Flag of requested files of extensions -> their data of the episode.
     """
 
     data: EpisodeData
@@ -70,7 +68,7 @@ class ExportedEpisode:
     transcoded: tuple[str, ...]
     has_statements: bool
     meanings: Mapping[str, str]
-    stages: EpisodeStages | None
+    extra: Mapping[str, Any]
 
 
 def export_episode(recording: Recording, options: ExportOptions) -> LeRobotEpisode:
@@ -112,8 +110,8 @@ def _motor_table(recording: Recording, motors: Motors) -> Table:
 
 
 def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
-    """Read an episode into memory. Raises ConfigError for boxes without segmentation, ExportError if it has no frames,
-    or frames without images, and RecordingError if it is damaged.
+    """Read an episode into memory. Raises ConfigError for files of extensions that need more, ExportError if it has no
+    frames, or frames without images, and RecordingError if it is damaged.
     """
     options, recording, fps, columns = episode.options, episode.recording, episode.info.fps, episode.columns
     reasons = reasons_to_transcode(episode)
@@ -140,7 +138,6 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         video_info=video_infos,
         pixels=pixels,
         record=EpisodeRecord.of(episode),
-        boxes=_episode_boxes(episode) if options.boxes else {},
     )
     info = DatasetInfo(
         fps=fps,
@@ -158,7 +155,7 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
             feature.name: feature.source or ", ".join(dict.fromkeys(filter(None, feature.units)))
             for feature in episode.info.features
         },
-        stages=episode_stages(recording) if options.progress else None,
+        extra={name: EXTRA_FILES.load(name).read(episode) for name in options.extra_files},
     )
 
 
@@ -191,23 +188,11 @@ def language_of(episode: LeRobotEpisode) -> EpisodeLanguage:
     if episode.scene is None:
         statements = [Statement(row=frame, kind="subtask", text=text) for frame, text in recording.subtasks]
     else:
-        statements = episode_statements(recording, options.spoken)
+        kinds = options.spoken
+        targets = dict.fromkeys(target for kind, target in rows_of("statements") if kind in kinds)
+        derived = chain.from_iterable(pkgutil.resolve_name(target)(recording, kinds) for target in targets)
+        statements = sorted(derived, key=lambda statement: statement.row)
     return episode_language(statements, fps=episode.info.fps)
-
-
-def _episode_boxes(episode: LeRobotEpisode) -> dict[str, SeenByCamera]:
-    boxes = {}
-    taken = {camera.name for camera in episode.cameras}
-    for camera in episode.info.simulated.scene.cameras:
-        if camera.name in taken and episode.recording.has_segmentation(camera.name):
-            entries = tuple(seen_objects(episode.recording, camera.name))
-            boxes[IMAGE_PREFIX + camera.name] = camera.width, camera.height, entries
-    if not boxes:
-        raise ConfigError(
-            "Boxes need recordings with segmentation (generate --segmentation), leave them out: "
-            f"{episode.recording.path}"
-        )
-    return boxes
 
 
 def reasons_to_transcode(episode: LeRobotEpisode) -> dict[ExportCamera, str]:

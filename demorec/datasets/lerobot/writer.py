@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import Closing
-from demorec.datasets.lerobot.boxes import BoxFile, SeenByCamera
 from demorec.datasets.lerobot.files import tables_in, write_text
 from demorec.datasets.lerobot.language import REPEATING, column_digests, is_language
 from demorec.datasets.lerobot.layout import (
@@ -71,7 +70,6 @@ class EpisodeData:
         annotated_tasks: Tasks of annotation columns, which the table of episodes also lists.
         timestamps: (T,) float32 or float64 seconds; None for multiples of 1/fps.
         record: Its data for the sidecar; None in a dataset without one.
-        boxes: Camera feature -> visible objects, if known.
     """
 
     task: str
@@ -84,7 +82,6 @@ class EpisodeData:
     annotated_tasks: Sequence[str] = ()
     timestamps: NDArray[Any] | None = None
     record: EpisodeRecord | None = None
-    boxes: Mapping[str, SeenByCamera] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:
@@ -148,12 +145,9 @@ class DatasetWriter(Closing):
         self._pixels: dict[str, PixelHistogram] = {}
         self._unseen: dict[str, Statistics] = {}  # of images without histograms
         self._sidecar = None if start.configs is None else SidecarWriter(root, info, start.configs)
-        self._boxes: dict[str, BoxFile] = {}
 
     def close(self) -> None:
         """Release the files; unfinished ones are dropped, or left in place."""
-        for boxes in self._boxes.values():
-            boxes.close()
         if self._sidecar is not None:
             self._sidecar.close()
         for video in self._videos.values():
@@ -211,10 +205,6 @@ class DatasetWriter(Closing):
             digest = episode_digest(episode.task, values, digests)
         if self._sidecar is not None and episode.record is not None:
             self._sidecar.add(self.num_episodes, digest, episode.record)
-        for key, seen in episode.boxes.items():
-            if key not in self._boxes:
-                self._boxes[key] = BoxFile(self._root, key, self._info.fps)
-            self._boxes[key].add(self.num_episodes, seen, self.num_frames, frames)
         self.num_frames += frames
         self.num_episodes += 1
         return digest
@@ -299,8 +289,6 @@ class DatasetWriter(Closing):
             total_tasks=len(self._tasks),
         )
         write_text(self._root / INFO_PATH, info.to_json())
-        for boxes in self._boxes.values():
-            boxes.finish()
         if self._sidecar is not None:
             self._sidecar.finish(export)
         return info

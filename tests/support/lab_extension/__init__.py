@@ -1,6 +1,6 @@
 """A third-party package that adds one item of every kind to demorec."""
 
-from demorec.api import CommandRow, ExporterRow, Extension, ReaderRow
+from demorec.api import CommandRow, ExporterRow, Extension, ExtraFilesRow, ReaderRow
 
 EXTENSION = Extension(
     name="lab",
@@ -19,6 +19,10 @@ EXTENSION = Extension(
         )
     },
     exporters={"labcsv": ExporterRow(target="lab_extension.csv_files:EXPORTER")},
+    statements={"motto": "lab_extension.words:mottoes"},
+    extra_files={
+        "frame_counts": ExtraFilesRow(target="lab_extension.words:FrameCounts", help="Write the episodes' lengths.")
+    },
     tasks={"lab_pick": "lab_extension.scenes:LabPick"},
     robots={"lab_panda": "lab_extension.scenes:LAB_PANDA"},
     cameras={"corner": "lab_extension.scenes:CORNER"},

@@ -17,7 +17,7 @@ import numpy as np
 
 from demorec.core.geometry import Array
 from demorec.episode.scene import Body, Goal, Scene
-from demorec.episode.words import COLOR_WORDS, VESSELS, nouns_of
+from demorec.episode.words import COLOR_WORDS, NOUNS, VESSELS
 
 MIN_GAP = 0.04
 """Minimum distance, metres, by which an object must be farther to a side, or nearer, than the next one."""
@@ -26,8 +26,26 @@ MIN_SIZE_RATIO = 1.15
 _AT_THE_PLACE = 0.01
 """Maximum distance, metres, of a mark's centre from a goal on that mark."""
 
+_SYNONYMS: Mapping[str, tuple[str, ...]] = {
+    "target": ("target", "mark", "square"),
+    "mark": ("mark", "target", "square"),
+}
+
 _IN_FRONT = ("left", "right", "leftmost", "rightmost", "middle", "smaller", "larger", "smallest", "largest")
 _BEHIND = ("nearest to the robot", "farthest from the robot")
+
+
+def nouns_of(body: Body) -> tuple[str, ...]:
+    """Return the nouns for a body, the usual one first: from its name, less colour and number, and from its shape."""
+    words = [word for word in body.name.split("_") if not word.isdigit() and word not in (*COLOR_WORDS, "other")]
+    noun = " ".join(NOUNS.get(word, word) for word in words) or "object"
+    nouns = _SYNONYMS.get(noun, (noun,))
+    x, y, z = body.shape.extents
+    if body.movable and body.shape.kind == "box":
+        nouns += ("cube",) if max(x, y, z) < 1.05 * min(x, y, z) else ("block",)
+    elif body.movable and body.shape.kind in ("cylinder", "sphere", "capsule"):
+        nouns += (body.shape.kind,)
+    return tuple(dict.fromkeys(nouns))
 
 
 class NamedThing(NamedTuple):

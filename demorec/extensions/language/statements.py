@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from itertools import pairwise
 
-from demorec.annotate import KINDS, LanguageKind, Statement
-from demorec.annotate.referring import joined, phrase_for, place_of, prepositions, situation
-from demorec.annotate.timeline import PhaseSegment, episode_timeline
-from demorec.annotate.wordings import task_wordings
 from demorec.core.geometry import Array
 from demorec.core.seeding import generator
+from demorec.datasets.lerobot.language import Statement
+from demorec.extensions.language.referring import joined, phrase_for, place_of, prepositions, situation
+from demorec.extensions.language.timeline import PhaseSegment, episode_timeline
+from demorec.extensions.language.wordings import task_wordings
 from demorec.mcap import Recording
 
 _SENTENCES = {
@@ -43,17 +43,9 @@ _RECOVERY = {
 _MIN_MOVE_M = 0.005
 _MIN_OPENING_CHANGE_M = 0.0025
 
-_GoalWords = dict[str, str]
-"""Words of a goal at one moment: "object" ("the red cube") and "place" ("the blue tray", or "its place" if empty).
 
-Its prepositions are "into" ("into", "onto" or "to") and "inside" ("in", "on" or "at")."""
-
-
-def episode_statements(recording: Recording, kinds: Collection[LanguageKind]) -> list[Statement]:
-    """Return the statements of the requested kinds in row order; within a row, in the order of `KINDS`.
-
-    Raises RecordingError if the recording is damaged.
-    """
+def episode_statements(recording: Recording, kinds: Collection[str]) -> list[Statement]:
+    """Return the statements of the requested kinds, kind by kind. Raises RecordingError if the recording is damaged."""
     narrator = _Narrator(recording)
     sentences = {
         "subtask": narrator.subtasks,
@@ -62,8 +54,7 @@ def episode_statements(recording: Recording, kinds: Collection[LanguageKind]) ->
         "motion": narrator.motions,
         "task_aug": narrator.wordings,
     }
-    found = [Statement(row, kind, text) for kind in KINDS if kind in kinds for row, text in sentences[kind]()]
-    return sorted(found, key=lambda statement: statement.row)
+    return [Statement(row, kind, text) for kind, said in sentences.items() if kind in kinds for row, text in said()]
 
 
 class _Narrator:
@@ -79,8 +70,10 @@ class _Narrator:
             attempt.first: self._goal_words(attempt.goal, attempt.first) for attempt in self._timeline.attempts
         }
 
-    def _goal_words(self, goal_index: int | None, frame: int) -> _GoalWords:
-        """Phrases that distinguish a goal's object and place from all other objects at a frame."""
+    def _goal_words(self, goal_index: int | None, frame: int) -> dict[str, str]:
+        """Return phrases that distinguish a goal's "object" and "place" from all other objects at a frame, and the
+        prepositions "into" ("into", "onto" or "to") and "inside" ("in", "on" or "at").
+        """
         if goal_index is None:
             return {"object": "the object", "place": "its place", "into": "to", "inside": "at"}
         goal = self._scene.goals[goal_index]

@@ -1,7 +1,7 @@
 """Wordings of one task that have the same meaning and are unambiguous in its scene.
 
-A wording is a template with phrases. The resolver (`demorec.annotate.referring`) proves each phrase: it reads the
-finished text and does not know the template.
+A wording is a template with phrases. The resolver (`referring.py`) proves each phrase: it reads the finished text and
+does not know the template.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from demorec.annotate.referring import (
+from demorec.episode.scene import Scene
+from demorec.extensions.language.referring import (
     Surroundings,
     joined,
     phrases_for,
@@ -22,7 +23,6 @@ from demorec.annotate.referring import (
     resolve,
     situation,
 )
-from demorec.episode.scene import Scene
 
 WORDINGS = 24
 """Number of wordings per episode, the same for every task."""

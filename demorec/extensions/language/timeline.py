@@ -1,8 +1,4 @@
-"""Timeline of an episode: segments of one phase, grouped into attempts at goals, and the progress that they make.
-
-Progress has SARM's stages (arXiv 2509.25358): a stage is one phase for one goal. Frames that undo progress belong to
-the stage to be repeated: after a miss, a drop or a bad placement the next approach begins, so progress falls back.
-"""
+"""Timeline of an episode: segments of one phase, grouped into attempts at goals."""
 
 from __future__ import annotations
 
@@ -11,32 +7,19 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from demorec.core.geometry import Array, Pose
+from demorec.core.geometry import Pose
 from demorec.episode.episode import Trajectory, consecutive_runs
 from demorec.episode.scene import Goal, Scene
-
-if TYPE_CHECKING:
-    from demorec.mcap import Recording
+from demorec.mcap import Recording
 
 AttemptEnd = Literal["placed", "missed", "dropped", "misplaced", "unfinished"]
 _FAILURES: Mapping[str, AttemptEnd] = {"miss": "missed", "drop": "dropped", "misplaced": "misplaced"}
 _MAX_PLACED_DISTANCE_M = 0.02
 """Maximum distance of an object from its goal after the last attempt to count as placed."""
-_STAGES = ("approach", "descend", "close", "lift", "transport", "lower", "release", "retreat")
-_STAGE_OF_PHASE = {phase: phase for phase in _STAGES} | {
-    "open": "approach",
-    "above_cube": "approach",
-    "hold": "lift",
-    "carry": "transport",
-    "recover": "approach",
-}
-"""Phase -> stage, with the tutorial's names, and the stage to repeat after a failure."""
-WHOLE_TASK = "task"
-"""The only stage of an episode with unknown phases."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,79 +116,3 @@ def _is_at_goal(goal: Goal, scene: Scene, trajectory: Trajectory) -> bool:
         name: Pose(position=poses[-1, :3], quat_xyzw=poses[-1, 3:]) for name, poses in trajectory.object_poses.items()
     }
     return goal.distance(ends.get(goal.onto, Pose()), ends[goal.object]) <= _MAX_PLACED_DISTANCE_M
-
-
-class StageRun(NamedTuple):
-    """Rows `first` to `last` of an episode, both included, in one stage, such as "goal 1: approach"."""
-
-    stage: str
-    first: int
-    last: int
-
-
-def dense_stages(num_goals: int, runs: Sequence[StageRun]) -> tuple[str, ...]:
-    """Return all stages of an episode with this number of goals, in order, without those that a script leaves out."""
-    if runs[0].stage == WHOLE_TASK:
-        return (WHOLE_TASK,)
-    done = {run.stage.partition(": ")[2] for run in runs}
-    is_whole = "release" in done  # otherwise the episode failed before the last stages
-    stages = [stage for stage in _STAGES if stage in done or not is_whole]
-    return tuple(f"goal {goal}: {stage}" for goal in range(1, num_goals + 1) for stage in stages)
-
-
-def dense_runs(timeline: EpisodeTimeline) -> list[StageRun]:
-    """Return the stages of an episode, in order of time; a single stage if the phases are not those of demorec's
-    skills.
-    """
-    names = [_stage_name(segment) for segment in timeline.segments]
-    if not all(names):
-        return [StageRun(WHOLE_TASK, 0, timeline.segments[-1].end - 1)]
-    stages: list[str] = []
-    for segment, name in zip(timeline.segments, names, strict=True):
-        stages += [name] * (segment.end - segment.first)
-    return [StageRun(name, first, end - 1) for name, first, end in consecutive_runs(stages)]
-
-
-def _stage_name(segment: PhaseSegment) -> str:
-    """Name of a segment's stage, "" if unknown."""
-    stage, attempt = _STAGE_OF_PHASE.get(segment.phase, ""), segment.attempt
-    if not stage or attempt.goal is None:
-        return ""
-    if attempt.end == "misplaced" and stage in ("release", "retreat"):
-        stage = "approach"
-    return f"goal {attempt.goal + 1}: {stage}"
-
-
-def proportions(episodes: Sequence[Sequence[StageRun]], stages: Sequence[str]) -> dict[str, float]:
-    """Stage -> mean share of an episode's time, over the episodes that have it; the shares sum to one."""
-    shares: dict[str, list[float]] = {stage: [] for stage in stages}
-    for runs in episodes:
-        lengths = dict.fromkeys((run.stage for run in runs), 0)
-        for run in runs:
-            lengths[run.stage] += run.last - run.first + 1
-        total = sum(lengths.values())
-        for stage in shares.keys() & lengths.keys():
-            shares[stage].append(lengths[stage] / total)
-    means = {stage: float(np.mean(found)) if found else 0.0 for stage, found in shares.items()}
-    whole = sum(means.values())
-    return {stage: mean / whole if whole else 0.0 for stage, mean in means.items()}
-
-
-def progress(runs: Sequence[StageRun], stages: Sequence[str], share: Mapping[str, float]) -> Array:
-    """(T,) progress in 0..1: the sum of the preceding stages' shares, plus a linear increase within the stage.
-
-    Args:
-        runs: Runs of one episode, in order, without gaps.
-        stages: Stages of this episode, in intended order.
-        share: Stage -> share of the whole.
-    """
-    weights = np.array([share.get(stage, 0.0) for stage in stages])
-    total = float(weights.sum())
-    bounds = np.concatenate([[0.0], np.cumsum(weights / total if total else np.full(len(stages), 1 / len(stages)))])
-    found = np.empty(runs[-1].last + 1)
-    for run in runs:
-        index = stages.index(run.stage)
-        length = run.last - run.first
-        within = np.arange(length + 1) / length if length else np.ones(1)
-        found[run.first : run.last + 1] = bounds[index] + within * (bounds[index + 1] - bounds[index])
-    return np.clip(found, 0.0, 1.0)
