@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from demorec.core.extension import CommandRow as CommandRow
     from demorec.core.extension import ExporterRow as ExporterRow
     from demorec.core.extension import Extension as Extension
+    from demorec.core.extension import KindRow as KindRow
     from demorec.core.extension import ReaderRow as ReaderRow
     from demorec.core.geometry import Pose as Pose
     from demorec.core.replacing import ReplaceableKind as ReplaceableKind
@@ -92,9 +93,11 @@ if TYPE_CHECKING:
     from demorec.tasks.success import placement_checks as placement_checks
     from demorec.testing import RobotContract as RobotContract
     from demorec.testing import TaskContract as TaskContract
+    from demorec.view.episode import Playback as Playback
     from demorec.view.paths import Paths as Paths
     from demorec.view.scene import log_episode as log_episode
     from demorec.view.scene import new_recording as new_recording
+    from demorec.view.sources import PlaybackSource as PlaybackSource
     from demorec.view.sources import find_episodes as find_episodes
 
 GROUPS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
@@ -146,7 +149,9 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "demorec.extensions.policies.gym_env": ("DemorecEnv", "env_id"),
     },
     "Write an extension": {
-        "demorec.core.extension": ("Extension", "CommandRow", "ExporterRow", "ReaderRow"),
+        "demorec.core.extension": ("Extension", "CommandRow", "ExporterRow", "ReaderRow", "KindRow"),
+        "demorec.view.sources": ("PlaybackSource",),
+        "demorec.view.episode": ("Playback",),
         "demorec.datasets.options": ("Exporter", "CommonOptions", "ExportReport", "ProgressCallback"),
         "demorec.datasets.episode": ("ExportEpisode",),
         "demorec.core.atomic": ("atomic_write",),

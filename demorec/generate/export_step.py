@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import shutil
 import time
 from collections.abc import Callable
@@ -9,11 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.core.errors import DemorecError, resource_error
+from demorec.core.extension import kind_rows
 from demorec.core.files import free_name, run_lock, sync_path
 from demorec.core.replacing import obstacle
 from demorec.datasets.lerobot.card import has_own_card
 from demorec.datasets.lerobot.export import export_lerobot
-from demorec.datasets.lerobot.inspect import check_tables, dataset_digest
+from demorec.datasets.lerobot.files import check_tables
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
@@ -71,21 +73,29 @@ def export_run(
 
 
 def _is_as_made(dataset: Path, record: ExportRecord, run: GeneratedRun) -> bool:
-    """Check that a dataset is complete and matches the run's record, by reading all its files."""
-    if not record.dataset_digest:  # the export was killed, before or after the dataset took its place
+    """Check that a dataset is complete and matches the run's record, by reading all its files if an extension can."""
+    digester = _digester()
+    if not record.dataset_digest or not digester:  # with no record, the export was killed, perhaps after its end
         return is_dataset_of_run(dataset, run.config_digest)
     try:
         check_tables(dataset)
-        return dataset_digest(dataset) == record.dataset_digest
+        return bool(pkgutil.resolve_name(digester)(dataset) == record.dataset_digest)
     except (DemorecError, OSError, ValueError) as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
         return False
 
 
+def _digester() -> str:
+    """Return "module:function" that computes a dataset's digest from its files; "" if no extension has one."""
+    row = kind_rows().get("dataset")
+    return "" if row is None else row.digester
+
+
 def _keep_what_is_not_ours(dataset: Path, folder: Path, says: Callable[[str], None]) -> None:
     """Move files to unfinished/ that would be lost when the run's dataset is replaced."""
-    if reason := obstacle(dataset, DATASET_KIND):
+    unknown = "" if _digester() else "no installed extension can tell whether it was changed"
+    if reason := obstacle(dataset, DATASET_KIND) or unknown:
         aside = _move_aside(dataset, folder)
         says(f"{DATASET}/ was moved to {aside} and is made again, since {reason}.")
     elif has_own_card(dataset):

@@ -20,10 +20,10 @@ from demorec.annotate.timeline import StageRun, dense_runs, dense_stages, episod
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS
-from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
 from demorec.episode.words import nouns_of
+from demorec.extensions.datasets.inspect import dataset_digest
 from demorec.mcap import Recording
 from demorec.tasks.furniture import THINGS
 

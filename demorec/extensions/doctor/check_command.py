@@ -14,8 +14,6 @@ from demorec.cli.shared.flags import Allow, Positional, allowed_modules, termina
 from demorec.cli.shared.output import ProgressBar, counted, say, say_json
 from demorec.cli.shared.paths import (
     MappingFile,
-    MotorFlags,
-    MotorsByFlags,
     NamedByFlags,
     Readable,
     RoleFlags,
@@ -25,6 +23,7 @@ from demorec.cli.shared.paths import (
 )
 from demorec.core.errors import ConfigError, describe_error
 from demorec.core.registry import nearest_match
+from demorec.extensions.datasets.motor_flags import MotorFlags, MotorsByFlags
 from demorec.extensions.doctor.examine import examine, lines_of
 
 if TYPE_CHECKING:
@@ -94,7 +93,7 @@ class CheckCommand:
     def _check(self) -> int:
         from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
         from demorec.core.processes import available_cores
-        from demorec.datasets.lerobot.files import leave_pandas_out
+        from demorec.extensions.datasets.command import leave_pandas_out
 
         leave_pandas_out()
         integrity, chosen = split_checks(self.only)

@@ -19,7 +19,7 @@ from demorec.episode.roles import Roles
 from demorec.extensions.doctor.robust import without_gaps
 
 if TYPE_CHECKING:
-    from demorec.datasets.lerobot.folder import LeRobotFolder
+    from demorec.extensions.datasets.folder import LeRobotFolder
     from demorec.extensions.doctor.thumbnails import CameraThumbnails
 
 Flags = NDArray[np.bool_]

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import noted, usable_numbers
-from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
-from demorec.datasets.lerobot.videos import opened_video
+from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.features import STATE
 from demorec.episode.roles import NO_NAMES, NamedRoles
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import noted, usable_numbers
+from demorec.extensions.datasets.robots import described, recognised_robot, robot_of_motors
+from demorec.extensions.datasets.videos import opened_video
 from demorec.extensions.doctor.diagnosis import diagnose
 from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence, continuous, joined
 from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails, Shrinker, frames_of
@@ -151,7 +152,7 @@ def _in_si(
     for name in (name for part in parts for name in part):
         width = columns[name].shape[1]
         usual_name = "action" if name in parts[1] else STATE
-        feature = robot.described(Feature(name=name, names=tuple(map(str, range(width)))), usual_name)
+        feature = described(robot, Feature(name=name, names=tuple(map(str, range(width)))), usual_name)
         found[name] = feature.in_si(columns[name])
     return found
 

@@ -25,11 +25,11 @@ from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import open_regular
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
-from demorec.datasets.lerobot.episode_places import EpisodePlace
 from demorec.datasets.lerobot.layout import DatasetFeature, video_info
 from demorec.datasets.lerobot.mp4 import EncodedVideo, one_image_file
-from demorec.datasets.lerobot.mp4_index import check_video, mp4_index
 from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.extensions.datasets.episode_places import EpisodePlace
+from demorec.extensions.datasets.mp4_index import check_video, mp4_index
 
 if TYPE_CHECKING:
     from demorec.mcap.video import Rgb

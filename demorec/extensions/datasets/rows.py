@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
-from demorec.datasets.lerobot.episode_places import EpisodePlace
-from demorec.datasets.lerobot.files import TableReader, column_numbers, table_batches
+from demorec.datasets.lerobot.files import TableReader, column_numbers, column_values, table_batches
 from demorec.datasets.lerobot.language import column_digests
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.extensions.datasets.episode_places import EpisodePlace
 
 if TYPE_CHECKING:
     from demorec.mcap.video import Rgb
@@ -166,13 +166,6 @@ def _column_errors(name: str, place: EpisodePlace) -> Iterator[None]:
         yield
     except (ValueError, TypeError, LookupError, pa.ArrowException) as error:
         raise ExportError(f"The column {name} holds values that are not numbers: {place.data}") from error
-
-
-def column_values(column: pa.Array) -> NDArray[Any]:
-    """Convert a column to (T, D) numbers, or (T, 1) texts."""
-    if str(column.type) in ("string", "large_string"):
-        return np.array(column.to_pylist(), dtype=np.str_).reshape(-1, 1)
-    return column_numbers(column)
 
 
 def _image_digests(column: pa.Array) -> NDArray[np.str_]:

@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
-from demorec.datasets.lerobot.episode_places import are_on_grid
-from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
-from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
-from demorec.datasets.lerobot.videos import EpisodeVideo
+from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.episode import Outcome, Table
 from demorec.episode.features import DEPTH_SUFFIX
 from demorec.episode.info import Camera, EpisodeInfo, Origin
 from demorec.episode.protocol import Episode, SceneMotion
 from demorec.episode.roles import Roles
+from demorec.extensions.datasets.episode_places import are_on_grid
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.robots import described, recognised_robot, robot_of_motors
+from demorec.extensions.datasets.videos import EpisodeVideo
 from demorec.mcap.sampled_writer import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.streams import frame_times
 from demorec.mcap.transforms import measured_motion
@@ -276,7 +277,7 @@ class DatasetRecording(Episode):
 
 def with_robot(info: EpisodeInfo, robot: DatasetRobot, roles: Roles) -> EpisodeInfo:
     """Add an arm and the joints that the features move to a description."""
-    features = tuple(robot.described(feature, roles.usual_name(feature.name)) for feature in info.features)
+    features = tuple(described(robot, feature, roles.usual_name(feature.name)) for feature in info.features)
     return replace(info, urdf=robot.urdf, features=features)
 
 

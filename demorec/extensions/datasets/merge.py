@@ -25,9 +25,9 @@ import numpy as np
 from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import read_text_limited
 from demorec.core.registry import check_choice
-from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import DatasetFeature
-from demorec.extensions.editing.plan import FeatureMapping, Plan
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.plan import FeatureMapping, Plan
 
 _UNITS = ("rad", "degree", "normalised")
 _MAX_BYTES = 1 << 20

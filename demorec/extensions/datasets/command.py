@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,8 +22,8 @@ from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.datasets.lerobot.paths import is_dataset
 
 if TYPE_CHECKING:
-    from demorec.datasets.lerobot.folder import LeRobotFolder
-    from demorec.extensions.editing.plan import EpisodeSlice, Plan
+    from demorec.extensions.datasets.folder import LeRobotFolder
+    from demorec.extensions.datasets.plan import EpisodeSlice, Plan
 
 _RESULT = replace(DATASET_KIND, advice="choose --overwrite or another --out")
 MAX_SHOWN = 20
@@ -71,8 +73,6 @@ class Edit:
 
     def run(self) -> int:
         """Plan, write, and print a summary."""
-        from demorec.datasets.lerobot.files import leave_pandas_out
-
         leave_pandas_out()
         if self.out is None and not self.dry_run:
             raise ConfigError("Name the folder of the new dataset (--out NEW), or preview it (--dry-run).")
@@ -95,7 +95,7 @@ class Edit:
 
     def _write(self, sources: Sequence[LeRobotFolder], outs: Sequence[Path]) -> None:
         """Write the new datasets, which appear together, and print a summary."""
-        from demorec.extensions.editing.write import write_plan
+        from demorec.extensions.datasets.write import write_plan
 
         results: list[tuple[int, int]] = []
         roots = [source.root for source in sources]
@@ -113,7 +113,7 @@ class Edit:
                 say(f"Images of {counted(decoded, 'episode')} were decoded for their statistics.")
 
     def _print_result(self, begin: str, name: str, plan: Plan, left: str) -> None:
-        from demorec.extensions.editing.beside import MAX_NAMES, copied_unchecked_files, left_out
+        from demorec.extensions.datasets.beside import MAX_NAMES, copied_unchecked_files, left_out
 
         lengths = [place.length for source in plan.sources for place in source.places]
         frames = sum(cut.last - cut.first for cut in plan.cuts)
@@ -137,13 +137,13 @@ class EditOne(Edit):
 
     def sources(self) -> Sequence[LeRobotFolder]:
         """The dataset."""
-        from demorec.datasets.lerobot.folder import LeRobotFolder
+        from demorec.extensions.datasets.folder import LeRobotFolder
 
         return [LeRobotFolder(dataset_at(self.dataset))]
 
     def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
         """The edited plan of the whole dataset."""
-        from demorec.extensions.editing.plan import Plan
+        from demorec.extensions.datasets.plan import Plan
 
         return {"": self.edited(Plan.whole(sources[0]))}
 
@@ -154,7 +154,7 @@ class EditOne(Edit):
 
 def _changes(plan: Plan) -> list[str]:
     """Lines about the changes of episodes."""
-    from demorec.datasets.lerobot.inspect import mistyped_features
+    from demorec.extensions.datasets.inspect import mistyped_features
 
     lines = []
     for source in plan.sources:
@@ -177,6 +177,24 @@ def _changes(plan: Plan) -> list[str]:
             head = counted(cut.first, "frame")
             lines.append(f"episode {cut.episode}: {head} cut at the beginning, {length - cut.last} at the end")
     return list(dict.fromkeys(lines))
+
+
+def leave_pandas_out() -> None:
+    """Make PyArrow work without pandas in this process. PyArrow would import pandas, which takes longer than most
+    edits, to check whether given lists are pandas objects.
+    """
+    import pyarrow as pa
+
+    finder = _NoPandas()
+    sys.meta_path.insert(0, finder)
+    pa.array([0])  # checks for pandas once and caches the result
+    sys.meta_path.remove(finder)
+
+
+class _NoPandas(MetaPathFinder):
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> None:
+        if fullname == "pandas":
+            raise ImportError
 
 
 def dataset_at(path: Path) -> Path:
