@@ -20,7 +20,7 @@ from demorec.cli.shared.paths import (
     tell_unfinished,
 )
 from demorec.core.errors import ConfigError, RecordingError
-from demorec.core.extension import kind_rows, reader_rows
+from demorec.core.extension import kind_function, kind_rows, reader_rows
 from demorec.episode.element_names import is_numbered
 from demorec.runs.find import expect, find
 from demorec.runs.foreign import dropped_by_import
@@ -87,10 +87,8 @@ def _described(paths: Sequence[Path]) -> dict[Path, Described]:
 
 
 def _describe(path: Path, named: NamedRoles) -> Described:
-    kinds = kind_rows()
-    kind = expect(path, "recording", "run", *kinds).kind
-    describers: dict[str, Callable[..., Described]] = {"recording": _recording, "run": _run}
-    describe = describers[kind] if kind in describers else pkgutil.resolve_name(kinds[kind].describer)
+    kind = expect(path, "recording", "run", *kind_rows()).kind
+    describe: Callable[..., Described] = kind_function(kind, "describer") or (_run if kind == "run" else _recording)
     return describe(path, named)
 
 

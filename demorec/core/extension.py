@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import entry_points
@@ -265,6 +265,13 @@ def reader_rows() -> dict[str, ReaderRow]:
 def kind_rows() -> dict[str, KindRow]:
     """Kind of path -> functions that read it without an import."""
     return dict(rows_of("kinds"))
+
+
+def kind_function(kind: str, name: str) -> Callable[..., Any] | None:
+    """Load a function of a kind of path by its name in `KindRow`; None if no extension has one."""
+    row = kind_rows().get(kind)
+    target = "" if row is None else getattr(row, name)
+    return pkgutil.resolve_name(target) if target else None
 
 
 def exporter_rows() -> dict[str, ExporterRow]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pkgutil
 import shutil
 import time
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.core.errors import DemorecError, resource_error
-from demorec.core.extension import kind_rows
+from demorec.core.extension import kind_function
 from demorec.core.files import free_name, run_lock, sync_path
 from demorec.core.replacing import obstacle
 from demorec.datasets.lerobot.card import has_own_card
@@ -74,28 +73,25 @@ def export_run(
 
 def _is_as_made(dataset: Path, record: ExportRecord, run: GeneratedRun) -> bool:
     """Check that a dataset is complete and matches the run's record, by reading all its files if an extension can."""
-    digester = _digester()
-    if not record.dataset_digest or not digester:  # with no record, the export was killed, perhaps after its end
+    digest_of = kind_function("dataset", "digester")
+    # Without a recorded digest, the export was killed, before or after the dataset took its place.
+    if not record.dataset_digest or digest_of is None:
         return is_dataset_of_run(dataset, run.config_digest)
     try:
         check_tables(dataset)
-        return bool(pkgutil.resolve_name(digester)(dataset) == record.dataset_digest)
+        return bool(digest_of(dataset) == record.dataset_digest)
     except (DemorecError, OSError, ValueError) as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
         return False
 
 
-def _digester() -> str:
-    """Return "module:function" that computes a dataset's digest from its files; "" if no extension has one."""
-    row = kind_rows().get("dataset")
-    return "" if row is None else row.digester
-
-
 def _keep_what_is_not_ours(dataset: Path, folder: Path, says: Callable[[str], None]) -> None:
     """Move files to unfinished/ that would be lost when the run's dataset is replaced."""
-    unknown = "" if _digester() else "no installed extension can tell whether it was changed"
-    if reason := obstacle(dataset, DATASET_KIND) or unknown:
+    reason = obstacle(dataset, DATASET_KIND)
+    if not reason and dataset.exists() and kind_function("dataset", "digester") is None:
+        reason = "no installed extension can tell whether it was changed"
+    if reason:
         aside = _move_aside(dataset, folder)
         says(f"{DATASET}/ was moved to {aside} and is made again, since {reason}.")
     elif has_own_card(dataset):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pkgutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from demorec.core.errors import ConfigError
-from demorec.core.extension import kind_rows
+from demorec.core.extension import kind_function, kind_rows
 from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
 from demorec.episode.simulated import scene_of
 from demorec.mcap import Recording
@@ -56,10 +55,9 @@ def find_episodes(
 
 
 def _sources(path: Path, include_failures: bool, named: NamedRoles) -> list[PlaybackSource]:
-    kinds = kind_rows()
-    found = expect(path, "recording", *kinds, *EPISODE_FOLDERS)
-    if found.kind in kinds:
-        sources: list[PlaybackSource] = pkgutil.resolve_name(kinds[found.kind].viewer)(path, named)
+    found = expect(path, "recording", *kind_rows(), *EPISODE_FOLDERS)
+    if (sources_of := kind_function(found.kind, "viewer")) is not None:
+        sources: list[PlaybackSource] = sources_of(path, named)
         return sources
     # Failed rollouts are regular results of an evaluation.
     shows_failures = include_failures or found.kind == "evaluation"

@@ -15,10 +15,7 @@ from demorec.datasets.lerobot.files import read_table, tables_in, write_text
 from demorec.datasets.lerobot.layout import TASKS_PATH, DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, SIDECAR_DIR
-from demorec.episode.features import (
-    ACTION,
-    ActionKind,
-)
+from demorec.episode.features import ACTION, ActionKind
 
 _MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
 """Last line of a card; its digest reveals whether the card was edited."""

@@ -6,12 +6,12 @@ Existing files are never opened for writing; new episodes get new files, as with
 from __future__ import annotations
 
 import os
-import pkgutil
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 from demorec.core.errors import ConfigError
-from demorec.core.extension import kind_rows
+from demorec.core.extension import kind_function
 from demorec.core.replacing import files_below
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetInfo
 from demorec.datasets.lerobot.paths import INFO_PATH
@@ -22,10 +22,9 @@ def start_after(root: Path) -> DatasetStart:
     """Read the state that a writer needs to continue a dataset. Raises ConfigError if no installed extension reads
     datasets, and errors as in the extension.
     """
-    row = kind_rows().get("dataset")
-    if row is None or not row.appender:
+    if (read := kind_function("dataset", "appender")) is None:
         raise ConfigError(f"No installed extension reads a dataset to append to: export into a new folder: {root}")
-    start: DatasetStart = pkgutil.resolve_name(row.appender)(root)
+    start: DatasetStart = read(root)
     return start
 
 
@@ -69,10 +68,7 @@ def link_files(source: Path, target: Path) -> None:
 
 def _link_or_copy(path: Path, copy: Path) -> None:
     if path.suffix in (".parquet", ".mp4") and not path.is_symlink():
-        try:
+        with suppress(OSError):  # another file system, or one without links
             os.link(path, copy)
-        except OSError:
-            pass  # another file system, or one without links
-        else:
             return
     shutil.copy2(path, copy)

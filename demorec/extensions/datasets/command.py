@@ -1,11 +1,10 @@
-"""`demorec dataset`: the parts that its commands share, which are the new dataset and its printed summary."""
+"""Parts that commands on datasets share: the new dataset and its printed summary, and the flags of an arm's servos."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,6 +19,7 @@ from demorec.core.registry import Registry
 from demorec.core.replacing import OptionalTarget, check_replaceable
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.datasets.lerobot.paths import is_dataset
+from demorec.robots.motors import Motors, MotorUnits
 
 if TYPE_CHECKING:
     from demorec.extensions.datasets.folder import LeRobotFolder
@@ -152,6 +152,32 @@ class EditOne(Edit):
         raise NotImplementedError
 
 
+@dataclass(frozen=True, kw_only=True)
+class MotorFlags:
+    """The servos of a real arm whose values LeRobot recorded as state and action."""
+
+    motor_units: MotorUnits | None = None
+    """Joint units of a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): degrees,
+    LeRobot's default, or -100..100 of each joint's range. The dataset does not record the units.
+    """
+    calibration: Path | None = None
+    """With --motor-units: LeRobot's calibration file of the arm (auto: an arm that matches its URDF)."""
+
+    @property
+    def named(self) -> Motors | None:
+        """The servos; None without --motor-units. Raises ConfigError if the calibration does not match them."""
+        from demorec.robots.so101 import SO101_FOLLOWER
+
+        if self.motor_units is not None:
+            return SO101_FOLLOWER.motors(self.motor_units, self.calibration)
+        if self.calibration is not None:
+            raise ConfigError("--calibration belongs to --motor-units.")
+        return None
+
+
+MotorsByFlags = Annotated[MotorFlags, arg(name="")]
+
+
 def _changes(plan: Plan) -> list[str]:
     """Lines about the changes of episodes."""
     from demorec.extensions.datasets.inspect import mistyped_features
@@ -185,16 +211,10 @@ def leave_pandas_out() -> None:
     """
     import pyarrow as pa
 
-    finder = _NoPandas()
-    sys.meta_path.insert(0, finder)
-    pa.array([0])  # checks for pandas once and caches the result
-    sys.meta_path.remove(finder)
-
-
-class _NoPandas(MetaPathFinder):
-    def find_spec(self, fullname: str, path: Any, target: Any = None) -> None:
-        if fullname == "pandas":
-            raise ImportError
+    if "pandas" not in sys.modules:
+        sys.modules["pandas"] = None  # type: ignore[assignment]  # importing it fails
+        pa.array([0])  # checks for pandas once and caches the result
+        del sys.modules["pandas"]
 
 
 def dataset_at(path: Path) -> Path:

@@ -16,13 +16,7 @@ import pyarrow as pa
 from demorec.core.errors import ExportError, without_path
 from demorec.core.replacing import shown
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, read_table, table_batches
-from demorec.datasets.lerobot.layout import (
-    AUTOMATIC_FEATURES,
-    STATS_PATH,
-    TASKS_PATH,
-    DatasetFeature,
-    DatasetInfo,
-)
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.extensions.datasets.episode_places import EpisodePlace, read_tasks
 from demorec.extensions.datasets.folder import LeRobotFolder

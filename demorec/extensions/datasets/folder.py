@@ -231,16 +231,10 @@ class LeRobotFolder:
 
     def rows(self, names: Sequence[str]) -> DataRows:
         """Read some columns of the data files."""
-        return DataRows(
-            self.info.features,
-            self.num_rows,
-            names,
-            fps=self.info.fps,
-            task_number=self._only_task_number,
-            own=self.own_counters,
-        )
+        return DataRows(self, names)
 
-    def _only_task_number(self, place: EpisodePlace) -> int:
+    def only_task_number(self, place: EpisodePlace) -> int:
+        """Return the number of the task of an episode whose rows have none. Raises ExportError if it has several."""
         if len(place.tasks) != 1 or place.tasks[0] not in self.tasks:
             raise ExportError(
                 f"The rows of episode {place.episode_index} have no task_index, and it has {len(place.tasks)} tasks in "
@@ -277,7 +271,7 @@ class LeRobotFolder:
                 f"{drop if len(without) < len(self.listed) else ''}leave the camera out (demorec dataset drop-features "
                 f"DATASET {key} --out NEW): {path}"
             )
-        return EpisodeVideo(self.open_video, key, place, self.info.features[key], int(self.info.fps))
+        return EpisodeVideo(self, key, place)
 
     @cached_property
     def stored_images(self) -> Mapping[str, StoredImages]:
@@ -346,10 +340,13 @@ class LeRobotFolder:
             if not (feature.is_camera or name in AUTOMATIC_FEATURES or why_not_recorded(name, feature))
         )
 
+    def is_absent(self, key: str) -> bool:
+        """Whether all of a camera's video files are missing, as after a download of the tables alone."""
+        return not any(place.videos[key][0].exists() for place in self.listed)
+
     def leave_out_missing_cameras(self) -> tuple[str, ...]:
         """Exclude the cameras without a video in any episode from recordings; return their features."""
-        videos = [key for key in self.keys.values() if self.info.features[key].is_video]
-        found = tuple(key for key in videos if not any(place.videos[key][0].exists() for place in self.listed))
+        found = tuple(key for key in self.keys.values() if self.info.features[key].is_video and self.is_absent(key))
         self.keys = {name: key for name, key in self.keys.items() if key not in found}
         return found
 

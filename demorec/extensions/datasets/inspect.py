@@ -32,15 +32,8 @@ from demorec.extensions.datasets.rows import DataRows
 OLD_STATS = "meta/episodes_stats.jsonl"
 """Statistics of each episode before v3.0."""
 _SIDECAR = (
-    "source",
-    "success",
-    "failure_phase",
-    "failure_reason",
-    "num_retries",
-    "attempt",
-    "run_episode_index",
-    "root_seed",
-)
+    "source", "success", "failure_phase", "failure_reason", "num_retries", "attempt", "run_episode_index", "root_seed",
+)  # fmt: skip
 """Columns of the sidecar for selecting episodes."""
 _DTYPE_NAMES = {"halffloat": "float16", "float": "float32", "double": "float64", "large_string": "string"}
 """Arrow's type names -> LeRobot's, if different."""

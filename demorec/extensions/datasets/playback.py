@@ -23,7 +23,7 @@ from demorec.episode.protocol import SceneMotion
 from demorec.episode.roles import NamedRoles
 from demorec.episode.validity import read_episode_info
 from demorec.extensions.datasets.folder import LeRobotFolder
-from demorec.extensions.datasets.recording import DatasetRecording, with_robot
+from demorec.extensions.datasets.recording import DatasetRecording
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import check_primitives
 from demorec.view.episode import Playback, feature_curves, simulated_curves
@@ -67,7 +67,7 @@ def open_dataset_episode(dataset: LeRobotFolder, number: int) -> Iterator[Playba
 
 def _playback(dataset: LeRobotFolder, number: int) -> Playback:
     root = dataset.root.resolve()
-    data: DatasetRecording = _ShownEpisode(dataset, number)
+    data = DatasetRecording(dataset, number, finds_robot=True)
     has_scene = data.known.get("root_seed") is not None and {STATE, ACTION} <= dataset.info.features.keys()
     if has_scene:
         data = _SimulatedEpisode(dataset, number)
@@ -86,16 +86,6 @@ def _playback(dataset: LeRobotFolder, number: int) -> Playback:
         curves=simulated_curves(data) if has_scene else feature_curves(data, dataset.roles),
         statements=statements,
     )
-
-
-class _ShownEpisode(DatasetRecording):
-    """An episode that, without a robot description, gets the arm identified by its joint names."""
-
-    @cached_property
-    def info(self) -> EpisodeInfo:
-        """The description of `DatasetRecording`, with that arm."""
-        info, robot = super().info, self.robot
-        return info if info.urdf or robot is None else with_robot(info, robot, self.dataset.roles)
 
 
 class _SimulatedEpisode(DatasetRecording):

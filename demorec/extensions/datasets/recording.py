@@ -43,6 +43,7 @@ class DatasetRecording(Episode):
 
     Args:
         number: Position of the episode in the dataset, from 0.
+        finds_robot: Whether to describe also an arm that its joints' names identify, or that other episodes lack.
 
     Attributes:
         known: The sidecar's data about it; empty if there are none.
@@ -50,9 +51,9 @@ class DatasetRecording(Episode):
     Methods and properties raise ExportError for unreadable files.
     """
 
-    def __init__(self, dataset: LeRobotFolder, number: int) -> None:
+    def __init__(self, dataset: LeRobotFolder, number: int, *, finds_robot: bool = False) -> None:
         self.place = place = dataset.places[number]
-        self.path, self.dataset = dataset.root, dataset
+        self.path, self.dataset, self._finds_robot = dataset.root, dataset, finds_robot
         self.num_frames = place.length
         self.known: Mapping[str, Any] = dataset.known.get(place.episode_index, {})
         self._is_depth = {name: dataset.info.features[key].is_depth for name, key in dataset.keys.items()}
@@ -90,7 +91,8 @@ class DatasetRecording(Episode):
             cameras=tuple(cameras),
             origin=Origin(kind="dataset"),
         )
-        return info if robot is None else with_robot(info, robot, self.dataset.roles)
+        robot = self.robot if robot is None and self._finds_robot else robot
+        return info if robot is None else _with_robot(info, robot, self.dataset.roles)
 
     def _instruction(self) -> str:
         indices = dict.fromkeys(self._rows["task_index"][:, 0].tolist())
@@ -275,7 +277,7 @@ class DatasetRecording(Episode):
         return texts, left_out
 
 
-def with_robot(info: EpisodeInfo, robot: DatasetRobot, roles: Roles) -> EpisodeInfo:
+def _with_robot(info: EpisodeInfo, robot: DatasetRobot, roles: Roles) -> EpisodeInfo:
     """Add an arm and the joints that the features move to a description."""
     features = tuple(described(robot, feature, roles.usual_name(feature.name)) for feature in info.features)
     return replace(info, urdf=robot.urdf, features=features)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,11 +18,12 @@ from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.files import TableReader, column_numbers, column_values, table_batches
 from demorec.datasets.lerobot.language import column_digests
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.extensions.datasets.episode_places import EpisodePlace
 
 if TYPE_CHECKING:
+    from demorec.extensions.datasets.folder import LeRobotFolder
     from demorec.mcap.video import Rgb
 
 _NUMBERS = ("float32", "float64", "int64", "bool")
@@ -37,34 +38,20 @@ class DataRows:
     Every row is verified by its `episode_index` and, if the file has one, `frame_index`. Missing counters and
     timestamps are derived from the position of the rows.
 
-    Args:
-        num_rows: Data file -> number of its episodes' rows.
-        task_number: Returns the number of the task of an episode whose rows have none.
-        own: Columns that verify the rows, if a file has them.
-
     Methods raise ExportError if the rows cannot be read, or belong to other episodes.
     """
 
-    def __init__(
-        self,
-        features: Mapping[str, DatasetFeature],
-        num_rows: Mapping[Path, int],
-        names: Sequence[str],
-        *,
-        fps: float,
-        task_number: Callable[[EpisodePlace], int],
-        own: Sequence[str] = OWN_COUNTERS,
-    ) -> None:
-        if missing := [name for name in names if name not in features]:
+    def __init__(self, folder: LeRobotFolder, names: Sequence[str]) -> None:
+        if missing := [name for name in names if name not in folder.info.features]:
             raise ExportError(f"The dataset has no {', '.join(missing)}, according to {INFO_PATH}")
         self.names = list(names)
-        self._features = {name: features[name] for name in names}
-        self._num_rows, self._fps, self._task_number, self._own = num_rows, fps, task_number, own
+        self._folder, self._num_rows, self._own = folder, folder.num_rows, folder.own_counters
+        self._features = {name: folder.info.features[name] for name in names}
         kinds = {feature.dtype for feature in self._features.values()}
         max_rows = 16 if "image" in kinds else 64 if kinds & {"string", "language"} else 4096
         self._automatic = [name for name in names if name in AUTOMATIC_FEATURES]
         stored = [name for name in names if name not in AUTOMATIC_FEATURES]
-        self._tables = TableReader(stored, optional=[*self._automatic, *own], rows=max_rows)
+        self._tables = TableReader(stored, optional=[*self._automatic, *self._own], rows=max_rows)
 
     def batches(self, place: EpisodePlace) -> Iterator[pa.RecordBatch]:
         """Yield the rows of an episode."""
@@ -92,12 +79,19 @@ class DataRows:
         for name in self._automatic:
             number = batch.schema.get_field_index(name)
             if number < 0:
-                values = _implied(name, frames, place, self._fps, self._task_number)
-                batch = batch.append_column(name, pa.array(values))
+                batch = batch.append_column(name, pa.array(self._implied(name, frames, place)))
             elif name != "timestamp" and batch.column(number).type != pa.int64():
                 with _column_errors(name, place):
                     batch = batch.set_column(number, name, batch.column(number).cast(pa.int64()))
         return batch
+
+    def _implied(self, name: str, frames: NDArray[np.int64], place: EpisodePlace) -> NDArray[Any]:
+        if name == "timestamp":
+            return (frames / self._folder.info.fps).astype(np.float32)
+        if name == "task_index":
+            return np.full(len(frames), self._folder.only_task_number(place))
+        first = {"frame_index": 0, "index": place.from_index, "episode_index": place.episode_index}[name]
+        return first + frames * (name != "episode_index")
 
     def read(self, place: EpisodePlace) -> pa.Table:
         """Read all rows of an episode. Raises ExportError also if it has none."""
@@ -133,17 +127,6 @@ class DataRows:
                 f"The column {name} has {values.shape[1:]} values, expected {feature.shape}: {place.data}"
             )
         return values
-
-
-def _implied(
-    name: str, frames: NDArray[np.int64], place: EpisodePlace, fps: float, task_number: Callable[[EpisodePlace], int]
-) -> NDArray[Any]:
-    if name == "timestamp":
-        return (frames / fps).astype(np.float32)
-    if name == "task_index":
-        return np.full(len(frames), task_number(place))
-    first = {"frame_index": 0, "index": place.from_index, "episode_index": place.episode_index}[name]
-    return first + frames * (name != "episode_index")
 
 
 def _check_own(batch: pa.RecordBatch, place: EpisodePlace, begin: int, own: Sequence[str]) -> None:

@@ -25,13 +25,14 @@ from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import open_regular
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
-from demorec.datasets.lerobot.layout import DatasetFeature, video_info
+from demorec.datasets.lerobot.layout import video_info
 from demorec.datasets.lerobot.mp4 import EncodedVideo, one_image_file
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.extensions.datasets.episode_places import EpisodePlace
 from demorec.extensions.datasets.mp4_index import check_video, mp4_index
 
 if TYPE_CHECKING:
+    from demorec.extensions.datasets.folder import LeRobotFolder
     from demorec.mcap.video import Rgb
 
 PacketCodec = Literal["h264", "h265", "av1"]
@@ -157,18 +158,17 @@ class EpisodeVideo:
     Methods and properties raise ExportError if the images cannot be read.
     """
 
-    def __init__(
-        self, open_file: Callable[[Path], VideoFile], key: str, place: EpisodePlace, feature: DatasetFeature, fps: int
-    ) -> None:
+    def __init__(self, folder: LeRobotFolder, key: str, place: EpisodePlace) -> None:
         self.path, self.first = place.videos[key]
         self.length = place.length
-        self._open_file, self._key, self._feature, self._fps = open_file, key, feature, fps
+        self._folder, self._key, self._feature = folder, key, folder.info.features[key]
+        self._fps = int(folder.info.fps)
         self._episode = place.episode_index
 
     @property
     def file(self) -> VideoFile:
         """The mp4 file."""
-        return self._open_file(self.path)
+        return self._folder.open_video(self.path)
 
     def _part(self, first: int, last: int) -> _Part:
         """Find frames `first` to `last` - 1, with all images from which they are decoded."""

@@ -23,7 +23,7 @@ from demorec.cli.shared.paths import (
 )
 from demorec.core.errors import ConfigError, describe_error
 from demorec.core.registry import nearest_match
-from demorec.extensions.datasets.motor_flags import MotorFlags, MotorsByFlags
+from demorec.extensions.datasets.command import MotorFlags, MotorsByFlags
 from demorec.extensions.doctor.examine import examine, lines_of
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.extension import ReaderRow, reader_rows
 from demorec.core.registry import nearest_match
 from demorec.core.replacing import OptionalTarget
-from demorec.extensions.datasets.motor_flags import MotorFlags, MotorsByFlags
+from demorec.extensions.datasets.command import MotorFlags, MotorsByFlags
 from demorec.runs.find import find
 
 if TYPE_CHECKING:

@@ -276,11 +276,8 @@ def _read(
             strip = None
             if has_strip and cameras:
                 strip = filmstrip(cameras[0], episode.num_frames, partial(episode.images_at, cameras[0]))
-            add_motion(
-                components,
-                roles if isinstance(roles, Roles) else roles_of_recording(info, roles),
-                table.features,
-            )
+            own_roles = roles if isinstance(roles, Roles) else roles_of_recording(info, roles)
+            add_motion(components, own_roles, table.features)
             attempt = f", attempt {info.attempt}" if info.attempt or path.parent.name == FAILED else ""
             return ReportedEpisode(
                 name=f"episode {info.episode_index}{attempt}",
