@@ -18,9 +18,6 @@ from demorec.datasets.lerobot.writer import DatasetStart
 from demorec.extensions.datasets.folder import LeRobotFolder
 from demorec.extensions.datasets.inspect import episode_digests
 
-_CONVERT = "demorec dataset select {} --where 'num_frames > 0' --out NEW"
-"""Command that writes all episodes in the current format."""
-
 
 def start_after(root: Path) -> DatasetStart:
     """Read the state that a writer needs to continue a dataset. Raises ExportError if it has another format, or is
@@ -28,10 +25,11 @@ def start_after(root: Path) -> DatasetStart:
     """
     folder = LeRobotFolder(root)
     info = folder.info
+    convert = f"demorec dataset select {shlex.quote(str(root))} --where 'num_frames > 0' --out NEW"
     if info.is_old:
         raise ExportError(
             f"The dataset has format {info.version}, and only {CODEBASE_VERSION} can be appended to. This converts it "
-            f"to {CODEBASE_VERSION}: {_CONVERT.format(shlex.quote(str(root)))}"
+            f"to {CODEBASE_VERSION}: {convert}"
         )
     if (root / PROGRESS_PATH).exists():
         raise ConfigError(f"{PROGRESS_PATH} has no progress of new episodes: remove it, or export all again: {root}")
@@ -47,7 +45,7 @@ def start_after(root: Path) -> DatasetStart:
         if absent := [name for name in needed if name not in open_table(path).schema_arrow.names]:
             raise ExportError(
                 f"The table of episodes lacks columns that new episodes have, such as {absent[0]}. This adds them: "
-                f"{_CONVERT.format(shlex.quote(str(root)))}"
+                f"{convert}"
             )
     try:
         tasks = tuple(folder.tasks) if info.total_tasks else ()

@@ -20,6 +20,8 @@ from demorec.core.replacing import OptionalTarget, check_replaceable
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.datasets.lerobot.paths import is_dataset
 from demorec.robots.motors import Motors, MotorUnits
+from demorec.runs.find import expect
+from demorec.runs.run_file import DATASET
 
 if TYPE_CHECKING:
     from demorec.extensions.datasets.folder import LeRobotFolder
@@ -219,9 +221,6 @@ def leave_pandas_out() -> None:
 
 def dataset_at(path: Path) -> Path:
     """The named dataset, or a run's dataset; ConfigError for anything else."""
-    from demorec.runs.find import expect
-    from demorec.runs.run_file import DATASET
-
     if expect(path, "dataset", "run").kind == "dataset":
         return path
     if not is_dataset(path / DATASET):

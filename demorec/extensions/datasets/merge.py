@@ -107,7 +107,7 @@ def _converted(
     own: DatasetFeature, mapping: FeatureMapping, item: Mapping[str, Any], model: DatasetFeature
 ) -> tuple[DatasetFeature, FeatureMapping]:
     """A converted feature of the merged dataset, which has one like `model`, and its mapping."""
-    if not _is_vector(own, model):
+    if not all(feature.is_numeric and len(feature.shape) == 1 for feature in (own, model)):
         raise ValueError("only vectors of numbers are converted")
     elements = None
     if "elements" in item:
@@ -149,7 +149,3 @@ def _differences(a: Plan, b: Plan) -> Iterator[str]:
             continue
         for what, value, first in feature.differences(there):
             yield f"{name} of {root} has {what} {value}, not {first}"
-
-
-def _is_vector(*features: DatasetFeature) -> bool:
-    return all(feature.is_numeric and len(feature.shape) == 1 for feature in features)

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import read_text_limited
@@ -38,12 +39,8 @@ def described(robot: DatasetRobot, feature: Feature, usual_name: str = "") -> Fe
         values = found.get(feature.name, found.get(usual_name, ()))
         return values if len(values) == len(feature.names) else ()
 
-    return replace(
-        feature,
-        joints=fitting(robot.joints),
-        units=fitting(robot.units),
-        calibration=fitting(robot.calibration),
-    )
+    known: Any = {name: fitting(getattr(robot, name)) for name in ("joints", "units", "calibration")}
+    return replace(feature, **known)
 
 
 @functools.cache

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from demorec.cli.shared.flags import arg
 from demorec.core.errors import ConfigError, check_seed
+from demorec.datasets.options import select_episodes
 from demorec.extensions.datasets.command import EditOne, pairs
 
 if TYPE_CHECKING:
@@ -35,7 +36,6 @@ class Chosen(EditOne):
 
     def chosen(self, plan: Plan) -> set[int]:
         """Numbers of the selected episodes."""
-        from demorec.datasets.options import select_episodes
         from demorec.extensions.datasets.condition import matching_episodes
 
         numbers = select_episodes(range(len(plan.cuts)), " ".join(self.episodes))
@@ -112,8 +112,6 @@ class Reorder(EditOne):
 
     def edited(self, plan: Plan) -> Plan:
         """All episodes in the new order."""
-        from demorec.datasets.options import select_episodes
-
         count = len(plan.cuts)
         order = select_episodes(range(count), " ".join(self.order), "order")
         if not self.order or sorted(order) != list(range(count)):

@@ -23,6 +23,7 @@ from demorec.cli.shared.paths import (
 )
 from demorec.core.errors import ConfigError, describe_error
 from demorec.core.registry import nearest_match
+from demorec.core.tables import FILE_CHECKS
 from demorec.extensions.datasets.command import MotorFlags, MotorsByFlags
 from demorec.extensions.doctor.examine import examine, lines_of
 
@@ -248,8 +249,6 @@ class Explain:
 
     def run(self) -> int:
         """Print the page of the check."""
-        from demorec.core.tables import FILE_CHECKS
-
         _, doctors = split_checks((self.check,))
         found = doctors[0] if doctors else FILE_CHECKS.load(self.check)
         width = min(terminal_width(), 100)
@@ -273,7 +272,6 @@ def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[Check, ..
     Raises:
         ConfigError: Unknown check.
     """
-    from demorec.core.tables import FILE_CHECKS
     from demorec.extensions.doctor.checks import all_checks
 
     if not names:
@@ -288,7 +286,6 @@ def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[Check, ..
 
 def check_rows() -> Iterator[tuple[str, str]]:
     """Yield (name, summary) of every check, the doctor's first."""
-    from demorec.core.tables import FILE_CHECKS
     from demorec.extensions.doctor.checks import all_checks
 
     for check in all_checks():
