@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -213,10 +214,16 @@ def leave_pandas_out() -> None:
     """
     import pyarrow as pa
 
-    if "pandas" not in sys.modules:
-        sys.modules["pandas"] = None  # type: ignore[assignment]  # importing it fails
-        pa.array([0])  # checks for pandas once and caches the result
-        del sys.modules["pandas"]
+    finder = _NoPandas()
+    sys.meta_path.insert(0, finder)
+    pa.array([0])  # checks for pandas once and caches the result
+    sys.meta_path.remove(finder)
+
+
+class _NoPandas(MetaPathFinder):
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> None:
+        if fullname == "pandas":
+            raise ImportError
 
 
 def dataset_at(path: Path) -> Path:

@@ -37,13 +37,12 @@ from demorec.extensions.datasets.episode_places import (
     relocated,
     rows_by_file,
 )
-from demorec.extensions.datasets.rows import OWN_COUNTERS, DataRows, EpisodeTable
+from demorec.extensions.datasets.rows import OWN_COUNTERS, DataRows, EpisodeTable, StoredImages
 
 # Code for videos, images, robots and the sidecar takes longer to load than most datasets' numbers to read.
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.robots import DatasetRobot
     from demorec.episode.info import Camera, Feature, Kept
-    from demorec.extensions.datasets.rows import StoredImages
     from demorec.extensions.datasets.videos import EpisodeVideo, VideoFile
     from demorec.robots.motors import Motors
 
@@ -81,12 +80,7 @@ class LeRobotFolder:
     """
 
     def __init__(
-        self,
-        root: Path,
-        motors: Motors | None = None,
-        named: NamedRoles = NO_NAMES,
-        *,
-        info: DatasetInfo | None = None,
+        self, root: Path, motors: Motors | None = None, named: NamedRoles = NO_NAMES, *, info: DatasetInfo | None = None
     ) -> None:
         self.root, self.motors, self._named = root, motors, named
         self.info = DatasetInfo.load(root) if info is None else info
@@ -276,8 +270,6 @@ class LeRobotFolder:
     @cached_property
     def stored_images(self) -> Mapping[str, StoredImages]:
         """Feature -> its images, for features stored in the data files."""
-        from demorec.extensions.datasets.rows import StoredImages
-
         keys = [name for name, feature in self.info.features.items() if feature.dtype == "image"]
         return {key: StoredImages(self.rows([key])) for key in keys}
 
