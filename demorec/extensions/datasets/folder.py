@@ -225,10 +225,9 @@ class LeRobotFolder:
 
     def rows(self, names: Sequence[str]) -> DataRows:
         """Read some columns of the data files."""
-        return DataRows(self, names)
+        return DataRows(self.info, self.num_rows, names, task_number=self._only_task_number, own=self.own_counters)
 
-    def only_task_number(self, place: EpisodePlace) -> int:
-        """Return the number of the task of an episode whose rows have none. Raises ExportError if it has several."""
+    def _only_task_number(self, place: EpisodePlace) -> int:
         if len(place.tasks) != 1 or place.tasks[0] not in self.tasks:
             raise ExportError(
                 f"The rows of episode {place.episode_index} have no task_index, and it has {len(place.tasks)} tasks in "
@@ -265,7 +264,7 @@ class LeRobotFolder:
                 f"{drop if len(without) < len(self.listed) else ''}leave the camera out (demorec dataset drop-features "
                 f"DATASET {key} --out NEW): {path}"
             )
-        return EpisodeVideo(self, key, place)
+        return EpisodeVideo(self.open_video, key, place, self.info)
 
     @cached_property
     def stored_images(self) -> Mapping[str, StoredImages]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,12 +18,11 @@ from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.files import TableReader, column_numbers, column_values, table_batches
 from demorec.datasets.lerobot.language import column_digests
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.extensions.datasets.episode_places import EpisodePlace
 
 if TYPE_CHECKING:
-    from demorec.extensions.datasets.folder import LeRobotFolder
     from demorec.mcap.video import Rgb
 
 _NUMBERS = ("float32", "float64", "int64", "bool")
@@ -38,15 +37,28 @@ class DataRows:
     Every row is verified by its `episode_index` and, if the file has one, `frame_index`. Missing counters and
     timestamps are derived from the position of the rows.
 
+    Args:
+        num_rows: Data file -> number of its episodes' rows.
+        task_number: Returns the number of the task of an episode whose rows have none.
+        own: Columns that verify the rows, if a file has them.
+
     Methods raise ExportError if the rows cannot be read, or belong to other episodes.
     """
 
-    def __init__(self, folder: LeRobotFolder, names: Sequence[str]) -> None:
-        if missing := [name for name in names if name not in folder.info.features]:
+    def __init__(
+        self,
+        info: DatasetInfo,
+        num_rows: Mapping[Path, int],
+        names: Sequence[str],
+        *,
+        task_number: Callable[[EpisodePlace], int],
+        own: Sequence[str],
+    ) -> None:
+        if missing := [name for name in names if name not in info.features]:
             raise ExportError(f"The dataset has no {', '.join(missing)}, according to {INFO_PATH}")
         self.names = list(names)
-        self._folder, self._num_rows, self._own = folder, folder.num_rows, folder.own_counters
-        self._features = {name: folder.info.features[name] for name in names}
+        self._fps, self._num_rows, self._task_number, self._own = info.fps, num_rows, task_number, own
+        self._features = {name: info.features[name] for name in names}
         kinds = {feature.dtype for feature in self._features.values()}
         max_rows = 16 if "image" in kinds else 64 if kinds & {"string", "language"} else 4096
         self._automatic = [name for name in names if name in AUTOMATIC_FEATURES]
@@ -87,9 +99,9 @@ class DataRows:
 
     def _implied(self, name: str, frames: NDArray[np.int64], place: EpisodePlace) -> NDArray[Any]:
         if name == "timestamp":
-            return (frames / self._folder.info.fps).astype(np.float32)
+            return (frames / self._fps).astype(np.float32)
         if name == "task_index":
-            return np.full(len(frames), self._folder.only_task_number(place))
+            return np.full(len(frames), self._task_number(place))
         first = {"frame_index": 0, "index": place.from_index, "episode_index": place.episode_index}[name]
         return first + frames * (name != "episode_index")
 

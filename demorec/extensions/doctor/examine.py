@@ -58,9 +58,8 @@ def examine(
         others = [finding for finding in extra if unopened.message not in finding.message]
         return Diagnosis(path=path, taken={}, findings=(unopened, *others), episodes=(), not_measured={}), None
     evidence.earlier = earlier
-    found = find(path)
     diagnosis = diagnose(evidence, chosen, extra)
-    if found.kind == "run" and evidence.folder is None:
+    if find(path).kind == "run" and evidence.folder is None:
         diagnosis = _with_dataset(diagnosis, path, options, chosen)
     results = [result for report in reports for result in report.results]
     not_measured = {

@@ -68,7 +68,6 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
     robot: DatasetRobot | None = None
     with noted(robot_problems, root):
         robot = _robot(folder, options, elements)
-    joints = _joints(robot, folder, elements)
     units = None if options.urdf else robot
     reader = folder.rows([name for name in folder.columns if folder.info.features[name].dtype != "image"])
     cameras = _camera_names(folder) if options.images else []
@@ -109,7 +108,7 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
         images_missing=_why_no_images(folder) if options.images else "images are not decoded (--no-images)",
         urdf=options.urdf or ("" if robot is None else robot.urdf),
         robot_problem="; ".join(robot_problems),
-        arm_joints=joints,
+        arm_joints=_joints(robot, folder, elements),
         opens_lerobot=options.lerobot,
     )
 
