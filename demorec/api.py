@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from demorec.core.extension import ExporterRow as ExporterRow
     from demorec.core.extension import Extension as Extension
     from demorec.core.extension import ExtraFilesRow as ExtraFilesRow
+    from demorec.core.extension import KindRow as KindRow
     from demorec.core.extension import ReaderRow as ReaderRow
     from demorec.core.geometry import Pose as Pose
     from demorec.core.replacing import ReplaceableKind as ReplaceableKind
@@ -96,9 +97,11 @@ if TYPE_CHECKING:
     from demorec.tasks.success import placement_checks as placement_checks
     from demorec.testing import RobotContract as RobotContract
     from demorec.testing import TaskContract as TaskContract
+    from demorec.view.episode import Playback as Playback
     from demorec.view.paths import Paths as Paths
     from demorec.view.scene import log_episode as log_episode
     from demorec.view.scene import new_recording as new_recording
+    from demorec.view.sources import PlaybackSource as PlaybackSource
     from demorec.view.sources import find_episodes as find_episodes
 
 GROUPS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
@@ -150,7 +153,9 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "demorec.extensions.policies.gym_env": ("DemorecEnv", "env_id"),
     },
     "Write an extension": {
-        "demorec.core.extension": ("Extension", "CommandRow", "ExporterRow", "ExtraFilesRow", "ReaderRow"),
+        "demorec.core.extension": ("Extension", "CommandRow", "ExporterRow", "ExtraFilesRow", "KindRow", "ReaderRow"),
+        "demorec.view.sources": ("PlaybackSource",),
+        "demorec.view.episode": ("Playback",),
         "demorec.datasets.options": ("Exporter", "CommonOptions", "ExportReport", "ProgressCallback"),
         "demorec.datasets.episode": ("ExportEpisode",),
         "demorec.datasets.lerobot.language": ("Statement",),

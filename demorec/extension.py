@@ -40,6 +40,5 @@ EXTENSION = Extension(
     file_checks={
         **_checks("file", "opens", "checksums", "readable", "complete", "missing_images", "images_decode"),
         **_checks("run", "run_files", "run_complete", "run_agrees"),
-        **_checks("dataset", "run_dataset", "dataset_sidecar"),
     },
 )

@@ -124,12 +124,8 @@ def print_comparison(original: Original, result: RunResult) -> bool:
 def next_commands(result: RunResult) -> list[str]:
     """Next commands for the user, quoted for the shell."""
     allow = [word for module in result.run.config.modules for word in ("--allow", module)]
-    return [shlex.join([_program("demorec"), name, str(result.folder), *allow]) for name in ("view", "check")]
-
-
-def _program(name: str) -> str:
-    """Command for a program in the user's shell: its path if PATH does not contain it."""
-    return name if shutil.which(name) else str(Path(sys.executable).with_name(name))
+    program = "demorec" if shutil.which("demorec") else str(Path(sys.executable).with_name("demorec"))
+    return [shlex.join([program, name, str(result.folder), *allow]) for name in ("view", "check")]
 
 
 def _failures(run: GeneratedRun) -> str:

@@ -1,9 +1,9 @@
-"""`demorec info`: show the content of a recording, a run or a dataset."""
+"""`demorec info`: show the content of a recording, a run, or data of a kind that an extension reads."""
 
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,25 +19,21 @@ from demorec.cli.shared.paths import (
     reading,
     tell_unfinished,
 )
-from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
-from demorec.core.extension import reader_rows
-from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.core.errors import ConfigError, RecordingError
+from demorec.core.extension import kind_function, kind_rows, reader_rows
 from demorec.episode.element_names import is_numbered
-from demorec.episode.features import IMAGE_PREFIX
 from demorec.runs.find import expect, find
 from demorec.runs.foreign import dropped_by_import
 
 if TYPE_CHECKING:
-    from demorec.datasets.lerobot.folder import LeRobotFolder
     from demorec.episode.roles import NamedRoles, Roles
     from demorec.runs.run_file import GeneratedRun, RunFile
 
 Described = tuple[dict[str, Any], list[str]]
 """Plain data for --json, and lines for the terminal."""
-_MOST_PROBLEMS = 5
 _MOST_ELEMENTS = 4
-"""Maximum problems of a dataset, and names of a vector's elements, that are listed one by one."""
-_NO_ROLE = "no role"
+"""Maximum names of a vector's elements that are listed one by one."""
+NO_ROLE = "no role"
 _SUCCESS_WORDS = {None: "unknown", True: "success", False: "failure"}
 
 
@@ -91,8 +87,8 @@ def _described(paths: Sequence[Path]) -> dict[Path, Described]:
 
 
 def _describe(path: Path, named: NamedRoles) -> Described:
-    kind = expect(path, "recording", "run", "dataset").kind
-    describe = {"recording": _recording, "run": _run, "dataset": _dataset}[kind]
+    kind = expect(path, "recording", "run", *kind_rows()).kind
+    describe: Callable[..., Described] = kind_function(kind, "describer") or (_run if kind == "run" else _recording)
     return describe(path, named)
 
 
@@ -170,9 +166,9 @@ def _recording_features(features: Sequence[Mapping[str, Any]]) -> Iterator[tuple
     roles = {feature["role"] for feature in features}
     yield from ((role, _not_found(role)) for role in ("state", "action") if role not in roles)
     for feature in sorted(features, key=lambda feature: feature["role"] is not None):
-        names = _elements_in_words(feature["elements"])
+        names = elements_in_words(feature["elements"])
         words = [
-            feature["role"] or _NO_ROLE,
+            feature["role"] or NO_ROLE,
             f"{len(feature['elements'])} {feature['dtype']}{f' ({names})' if names else ''}",
             ", ".join(dict.fromkeys(filter(None, feature["units"]))) or "units unknown",
             f"at most {1000 * feature['oldest']:.3g} ms old",
@@ -185,7 +181,7 @@ def _not_found(role: str) -> str:
     return f"not found: --{role} FEATURE names it"
 
 
-def _elements_in_words(names: Sequence[str]) -> str:
+def elements_in_words(names: Sequence[str]) -> str:
     """Names of a vector's elements in one line; only the first and the last if there are many."""
     if is_numbered(names):
         return "unnamed" if len(names) > 1 else ""
@@ -203,7 +199,7 @@ def _run(path: Path, named: NamedRoles) -> Described:
     if not isinstance(run, GeneratedRun):
         state = f"external, {state}"
         roles, left_out = _roles_of_run(path, run, named), dropped_by_import(path)
-        plain |= {"kind": "external run", "roles": _plain_roles(roles), "left_out": left_out}
+        plain |= {"kind": "external run", "roles": plain_roles(roles), "left_out": left_out}
         content = _external_facts(run, roles)
     elif named:
         raise ConfigError(SIMULATED_ROLES)
@@ -248,7 +244,7 @@ def _external_facts(run: RunFile, roles: Roles | None) -> Iterator[tuple[str, st
     counts = {word: sum(line.success is success for line in run.attempts) for success, word in _SUCCESS_WORDS.items()}
     parts = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
     yield "episodes", f"{len(run.attempts)}{f' ({parts})' if parts else ''}"
-    yield from _role_facts(roles)
+    yield from role_facts(roles)
     if run.unfinished:
         yield "missing", f"{counted(run.num_missing, 'item')}: {run.unfinished}."
 
@@ -264,19 +260,20 @@ def _roles_of_run(path: Path, run: RunFile, named: NamedRoles) -> Roles | None:
     return None
 
 
-def _plain_roles(roles: Roles | None) -> dict[str, Any] | None:
+def plain_roles(roles: Roles | None) -> dict[str, Any] | None:
+    """Plain data about the roles; None if they are unknown."""
     if roles is None:
         return None
     state, action = list(roles.state), list(roles.action)
     return {"of": dict(roles.of), "state": state, "action": action, "grippers": _grippers(roles)}
 
 
-def _role_facts(roles: Roles | None) -> Iterator[tuple[str, str]]:
+def role_facts(roles: Roles | None) -> Iterator[tuple[str, str]]:
     """(name, value) of the features without a role, state, action and grippers."""
     if roles is None:
         return
     if roles.unknown:
-        yield _NO_ROLE, ", ".join(roles.unknown)
+        yield NO_ROLE, ", ".join(roles.unknown)
     for role, parts in (("state", roles.state), ("action", roles.action)):
         count = len(roles.elements(parts))
         yield role, f"{', '.join(parts)} ({count} elements)" if parts else _not_found(role)
@@ -287,83 +284,3 @@ def _grippers(roles: Roles) -> list[str]:
     """Names of the state's elements that are grippers."""
     elements = zip(roles.elements(roles.state), roles.grippers().tolist(), strict=True)
     return [name for name, is_gripper in elements if is_gripper]
-
-
-def _dataset(path: Path, named: NamedRoles) -> Described:
-    from demorec.datasets.lerobot.files import read_json
-
-    file = path / INFO_PATH
-    roles = None
-    try:
-        info: dict[str, Any] = read_json(file)
-        facts = [
-            ("dataset", f"{path} (LeRobot {info['codebase_version']})"),
-            ("episodes", str(info["total_episodes"])),
-            ("frames", f"{info['total_frames']} ({info['total_frames'] / info['fps']:.1f} s at {info['fps']} Hz)"),
-            ("tasks", str(info["total_tasks"])),
-            ("robot", str(info["robot_type"])),
-            ("size", size_in_words(sum(part.stat().st_size for part in path.rglob("*") if part.is_file()))),
-        ]
-        folder, more, problems = _dataset_content(path, named)
-        with suppress(ExportError):  # one of the problems
-            roles = None if folder is None else folder.roles
-        facts += [*_role_facts(roles), *more, *(("problem", problem) for problem in problems[:_MOST_PROBLEMS])]
-        if len(problems) > _MOST_PROBLEMS:
-            facts.append(("problems", f"{len(problems)} in all; demorec check reports more"))
-        rows = _feature_rows(roles, info)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
-        raise RecordingError(f"The dataset's info.json is damaged ({describe_error(error)}): {file}") from error
-    plain = {"kind": "dataset", "path": str(path), "info": info, "problems": problems, "roles": _plain_roles(roles)}
-    return plain, [*aligned(facts), "", *aligned(rows)]
-
-
-def _dataset_content(path: Path, named: NamedRoles) -> tuple[LeRobotFolder | None, list[tuple[str, str]], list[str]]:
-    """The open dataset, table content beyond info.json, if readable, and the problems of the dataset."""
-    from demorec.datasets.lerobot.folder import LeRobotFolder
-    from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests, without_digest
-    from demorec.datasets.lerobot.layout import combined_digest
-
-    folder: LeRobotFolder | None = None
-    facts: list[tuple[str, str]] = []
-    problems: list[str] = []
-    try:
-        folder = LeRobotFolder(path, named=named)
-        problems += dataset_problems(folder)
-        for name, item in folder.info.features.items():
-            if item.is_video:
-                codec = (item.info or {}).get("video.codec", "")
-                width, height = item.image_size
-                facts.append(("camera", f"{name.removeprefix(IMAGE_PREFIX)} {width}x{height} {codec}"))
-        if problems:
-            return folder, facts, problems
-        outcomes = [row["success"] for row in folder.sidecar(["success"])]
-        if any(outcome is not None for outcome in outcomes):
-            unknown = f", {outcomes.count(None)} unknown" if None in outcomes else ""
-            facts.insert(0, ("successes", f"{outcomes.count(True)} of {len(outcomes)}{unknown}"))
-        if not without_digest(folder.info):
-            facts.append(("digest", combined_digest(folder.info, episode_digests(folder))))
-    except ExportError as error:
-        if (lack := resource_error(error)) is not None:
-            raise lack from error
-        problems.append(without_path(error, path))
-    return folder, facts, problems
-
-
-def _feature_rows(roles: Roles | None, info: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """A row for each feature of a dataset, after a header: features without a role first, counters last.
-
-    Args:
-        roles: Role of each feature; None if info.json cannot be interpreted.
-        info: Content of info.json, unchecked.
-    """
-    types = {name: (str(item["dtype"]), "x".join(map(str, item["shape"]))) for name, item in info["features"].items()}
-    if roles is None:
-        return [("feature", "dtype", "shape"), *((name, *kind) for name, kind in types.items())]
-    from demorec.episode.roles import ROLES
-
-    order = [None, *(role for role in ROLES if role is not None)]
-    rows = [("role", "feature", "dtype", "shape", "elements")]
-    for name in sorted(roles.of, key=lambda name: order.index(roles.of[name])):
-        column, role = roles.columns[name], roles.of[name]
-        rows.append((role or _NO_ROLE, name, *types[name], _elements_in_words(column.elements)))
-    return rows + [("", name, *kind, "") for name, kind in types.items() if name not in roles.of]

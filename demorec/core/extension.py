@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import entry_points
@@ -92,6 +92,25 @@ class ReaderRow:
 
 
 @dataclass(frozen=True, kw_only=True)
+class KindRow:
+    """A kind of files or folders that commands read as they are, without an import.
+
+    Attributes:
+        plural: Plural noun: "LeRobot datasets".
+        viewer: "module:function" of (path, named roles): its episodes as `demorec.view.sources.PlaybackSource`s.
+        describer: "module:function" of (path, named roles): (plain data, lines) for `demorec info`.
+        digester: "module:function" of a path: its content digest, as in `ExportReport`.
+        appender: "module:function" of a path: its state before the first episode that an export appends to it.
+    """
+
+    plural: str
+    viewer: str
+    describer: str
+    digester: str = ""
+    appender: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ExporterRow:
     """A format for exporting recordings.
 
@@ -132,6 +151,7 @@ class Extension:
         needs: Names of the extensions that it imports.
         commands: Name -> command.
         readers: Kind of path -> reader. "dataset", "hdf5" and "rosbag" are kinds that the core knows.
+        kinds: Kind of path -> functions that read it without an import.
         tasks, robots, cameras, objects, renderers: Name -> subclass of `Task`, `RobotSpec`, `CameraPreset`, `Shelf`,
         class with the methods of `Renderer`.
         executors: Name for `--executor` of `generate-dataset` -> context manager of `RunOptions` that connects to other
@@ -156,6 +176,7 @@ class Extension:
     needs: tuple[str, ...] = ()
     commands: Mapping[str, CommandRow] = field(default_factory=dict)
     readers: Mapping[str, ReaderRow] = field(default_factory=dict)
+    kinds: Mapping[str, KindRow] = field(default_factory=dict)
     tasks: Rows = field(default_factory=dict)
     robots: Rows = field(default_factory=dict)
     cameras: Rows = field(default_factory=dict)
@@ -261,6 +282,18 @@ def command_rows() -> dict[str, CommandRow]:
 def reader_rows() -> dict[str, ReaderRow]:
     """Kind of path -> its reader."""
     return dict(rows_of("readers"))
+
+
+def kind_rows() -> dict[str, KindRow]:
+    """Kind of path -> functions that read it without an import."""
+    return dict(rows_of("kinds"))
+
+
+def kind_function(kind: str, name: str) -> Callable[..., Any] | None:
+    """Load a function of a kind of path by its name in `KindRow`; None if no extension has one."""
+    row = kind_rows().get(kind)
+    target = "" if row is None else getattr(row, name)
+    return pkgutil.resolve_name(target) if target else None
 
 
 def exporter_rows() -> dict[str, ExporterRow]:

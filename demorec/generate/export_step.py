@@ -9,11 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.core.errors import DemorecError, resource_error
+from demorec.core.extension import kind_function
 from demorec.core.files import free_name, run_lock, sync_path
 from demorec.core.replacing import obstacle
 from demorec.datasets.lerobot.card import has_own_card
 from demorec.datasets.lerobot.export import export_lerobot
-from demorec.datasets.lerobot.inspect import check_tables, dataset_digest
+from demorec.datasets.lerobot.files import check_tables
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
@@ -71,12 +72,14 @@ def export_run(
 
 
 def _is_as_made(dataset: Path, record: ExportRecord, run: GeneratedRun) -> bool:
-    """Check that a dataset is complete and matches the run's record, by reading all its files."""
-    if not record.dataset_digest:  # the export was killed, before or after the dataset took its place
+    """Check that a dataset is complete and matches the run's record, by reading all its files if an extension can."""
+    digest_of = kind_function("dataset", "digester")
+    # Without a recorded digest, the export was killed, before or after the dataset took its place.
+    if not record.dataset_digest or digest_of is None:
         return is_dataset_of_run(dataset, run.config_digest)
     try:
         check_tables(dataset)
-        return dataset_digest(dataset) == record.dataset_digest
+        return bool(digest_of(dataset) == record.dataset_digest)
     except (DemorecError, OSError, ValueError) as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
@@ -85,7 +88,10 @@ def _is_as_made(dataset: Path, record: ExportRecord, run: GeneratedRun) -> bool:
 
 def _keep_what_is_not_ours(dataset: Path, folder: Path, says: Callable[[str], None]) -> None:
     """Move files to unfinished/ that would be lost when the run's dataset is replaced."""
-    if reason := obstacle(dataset, DATASET_KIND):
+    reason = obstacle(dataset, DATASET_KIND)
+    if not reason and dataset.exists() and kind_function("dataset", "digester") is None:
+        reason = "no installed extension can tell whether it was changed"
+    if reason:
         aside = _move_aside(dataset, folder)
         says(f"{DATASET}/ was moved to {aside} and is made again, since {reason}.")
     elif has_own_card(dataset):

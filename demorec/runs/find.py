@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from demorec.core.errors import ConfigError, resource_error
-from demorec.core.extension import ExporterRow, ReaderRow, exporter_rows, reader_rows
+from demorec.core.extension import ExporterRow, ReaderRow, exporter_rows, kind_rows, reader_rows
 from demorec.core.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
 from demorec.core.replacing import is_utf8, shown
 from demorec.datasets.lerobot.paths import INFO_PATH
@@ -150,7 +150,9 @@ def _words(kind: PathKind) -> tuple[str, str]:
     if row is None and kind not in _WORDS:
         return exporter_rows()[kind].name, "; name the run that it was made from"
     if row is None or (kind in _WORDS and not row.advice):
-        return _WORDS[kind]
+        name, advice = _WORDS[kind]
+        is_read = row is not None or kind in kind_rows() or kind not in ("dataset", "hdf5", "rosbag")
+        return name, advice if is_read else f", which no installed extension reads{advice}"
     return row.name, f"; {row.advice}" if row.advice else ""
 
 

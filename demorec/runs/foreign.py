@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Protocol
 
 from demorec.core.errors import ConfigError, DemorecError
-from demorec.core.extension import ReaderRow, reader_rows
+from demorec.core.extension import ReaderRow, kind_rows, reader_rows
 from demorec.runs.find import PathKind, find
 
 Tell = Callable[[str], None]
@@ -33,8 +33,8 @@ class ImportResult(Protocol):
 
 
 def imported_kinds() -> tuple[PathKind, ...]:
-    """Kinds of paths that are read only through an import; datasets are read directly except for an export."""
-    return tuple(kind for kind in reader_rows() if kind != "dataset")
+    """Kinds of paths that are read only through an import; others, such as datasets, are imported for an export."""
+    return tuple(kind for kind in reader_rows() if kind not in kind_rows())
 
 
 def dropped_by_import(run: Path) -> list[dict[str, str]]:
@@ -94,7 +94,7 @@ def _imported(path: Path, form: ReaderRow, mapping: Path | None, run: Path, tell
 def import_kind(path: Path, imports_datasets: bool) -> PathKind | None:
     """Return the kind under which a path is imported; None if it is read directly, or by no command."""
     kind = find(path).kind
-    return kind if kind in imported_kinds() or (imports_datasets and kind == "dataset") else None
+    return kind if kind in imported_kinds() or (imports_datasets and kind in reader_rows()) else None
 
 
 def _suggested(path: Path, form: ReaderRow, target: Path, tell: Tell) -> Path:

@@ -1,4 +1,4 @@
-"""The episodes of a path: one recording, a run, or an exported dataset."""
+"""The episodes of a path: one recording, a run, or data of a kind that an extension reads."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from functools import partial
 from pathlib import Path
 
 from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.core.extension import kind_function, kind_rows
 from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
 from demorec.episode.simulated import scene_of
 from demorec.mcap import Recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.runs.run_file import EPISODES, FAILED
 from demorec.view.episode import Playback, feature_curves, simulated_curves
-from demorec.view.from_dataset import open_dataset_episode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +27,7 @@ class PlaybackSource:
     Attributes:
         name: Readable name.
         open: Context manager that yields the episode; RecordingError if it cannot be read.
-        notes: Sentences on how its dataset was read.
+        notes: Sentences on how its data were read.
     """
 
     name: str
@@ -56,21 +55,10 @@ def find_episodes(
 
 
 def _sources(path: Path, include_failures: bool, named: NamedRoles) -> list[PlaybackSource]:
-    found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
-    if found.kind == "dataset":
-        dataset = LeRobotFolder(path, named=named)
-        if not dataset.places:
-            raise ConfigError(f"The dataset has no episodes to show: {path}")
-        missing = dataset.leave_out_missing_cameras()
-        notes = (*dataset.notes, *(f"No episode has a video of {key}, which is not shown: {path}" for key in missing))
-        return [
-            PlaybackSource(
-                name=f"{path}: episode {place.episode_index}",
-                open=partial(open_dataset_episode, dataset, number),
-                notes=notes,
-            )
-            for number, place in enumerate(dataset.places)
-        ]
+    found = expect(path, "recording", *kind_rows(), *EPISODE_FOLDERS)
+    if (sources_of := kind_function(found.kind, "viewer")) is not None:
+        sources: list[PlaybackSource] = sources_of(path, named)
+        return sources
     # Failed rollouts are regular results of an evaluation.
     shows_failures = include_failures or found.kind == "evaluation"
     files = [*found.recordings, *(found.failed if shows_failures else ())]

@@ -10,8 +10,8 @@ from support.commands import exit_code
 from support.export import episode_rows, files_of, make_run
 
 from demorec.datasets.lerobot.export import export_lerobot
-from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.datasets.lerobot.options import ExportOptions
+from demorec.extensions.datasets.inspect import dataset_digest
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 
 from demorec.cli import COMMANDS, generate_dataset_main, main
 from demorec.core.tables import EXPORTERS
-from demorec.extensions.editing.command import DatasetCommand
+from demorec.extensions.datasets.command import DatasetCommand
 
 PROGRAMS = (
     "demorec",

@@ -12,8 +12,8 @@ from support.export import export, make_run
 from support.language import NOUNS, language_of
 
 from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import dataset_digest
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import dataset_digest
 from demorec.mcap import Recording
 
 PREFIX = "observation.images."
@@ -78,7 +78,7 @@ def test_boxes_need_segmentation_and_a_whole_dataset(tmp_path: Path) -> None:
 def test_playback_has_the_words(dataset: Path, tmp_path: Path) -> None:
     from rerun.chunk import RrdReader
 
-    from demorec.view.from_dataset import open_dataset_episode
+    from demorec.extensions.datasets.playback import open_dataset_episode
     from demorec.view.scene import save
     from demorec.view.sources import find_episodes
 

@@ -25,7 +25,7 @@ from support.export import data_table, recordings
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 from support.stored_episodes import task_texts
 
-from demorec.datasets.lerobot.episode_places import are_on_grid
+from demorec.extensions.datasets.episode_places import are_on_grid
 from demorec.mcap import Recording
 from demorec.view.sources import find_episodes
 

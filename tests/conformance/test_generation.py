@@ -13,9 +13,9 @@ from support.commands import exit_code
 from demorec.cli import generate_dataset_main
 from demorec.core.config import GenerateConfig
 from demorec.datasets.lerobot.export import export_lerobot
-from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.verify import Verifier
+from demorec.extensions.datasets.folder import LeRobotFolder
 from demorec.generate.export_step import export_run
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.generate.run import generate
@@ -75,7 +75,7 @@ def test_runs_are_regenerated_and_differences_found(
 
 @pytest.mark.usefixtures("without_lerobot")
 def test_a_dataset_of_few_features_can_be_shown(tmp_path: Path, reference: RunResult) -> None:
-    from demorec.view.from_dataset import open_dataset_episode
+    from demorec.extensions.datasets.playback import open_dataset_episode
 
     few = ExportOptions(features=("observation.images.wrist",), action="ee_delta", verify=False)
     export_lerobot([reference.folder], tmp_path / "few", few)

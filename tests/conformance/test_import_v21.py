@@ -12,9 +12,9 @@ from support.drawn_datasets import PLAIN, STATE, TASKS, write_v21
 from support.export import recordings
 from support.stored_episodes import stored_episodes
 
-from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.playback import open_dataset_episode
 from demorec.mcap import Recording
-from demorec.view.from_dataset import open_dataset_episode
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"
 

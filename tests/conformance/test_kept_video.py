@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from support import bag_mappings, bags
 from support.export import episode_rows, export
 
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import dataset_digest
-from demorec.datasets.lerobot.recording import DatasetRecording
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import dataset_digest
+from demorec.extensions.datasets.playback import open_dataset_episode
+from demorec.extensions.datasets.recording import DatasetRecording
 from demorec.extensions.imports.dataset_import import import_lerobot
 from demorec.extensions.imports.import_run import import_bags
 from demorec.mcap import Recording
-from demorec.view.from_dataset import open_dataset_episode
 
 TOPIC, KEY = "/cameras/cam_high/image", "observation.images.high"
 GOP = 20

@@ -17,11 +17,11 @@ from support.language import active, language_of, meant, phrases, scene_at
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS
-from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.datasets.lerobot.options import KINDS
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
 from demorec.episode.words import NOUNS
+from demorec.extensions.datasets.inspect import dataset_digest
 from demorec.extensions.language.progress import StageRun, dense_runs, dense_stages, proportions
 from demorec.extensions.language.referring import nouns_of, place_of
 from demorec.extensions.language.timeline import episode_timeline

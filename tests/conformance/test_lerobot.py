@@ -18,7 +18,7 @@ from support.recording import make_episode
 
 import demorec.datasets.lerobot.parquet
 from demorec.datasets.lerobot.depth import DepthScale, quantised
-from demorec.datasets.lerobot.inspect import dataset_digest
+from demorec.extensions.datasets.inspect import dataset_digest
 from demorec.mcap import Recording
 
 LENGTHS = (20, 15, 17, 9, 31, 12)

@@ -17,8 +17,8 @@ from support.external import TOP, URDF, Episode, make_external, write_external
 
 from demorec.core.geometry import Pose
 from demorec.core.text import printable
-from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.episode.info import Camera
+from demorec.extensions.datasets.inspect import dataset_digest
 from demorec.mcap import Recording
 
 MILLIMETRES = Camera(name="near_depth", width=32, height=24, kept="16UC1")

@@ -14,9 +14,9 @@ from support.commands import exit_code
 
 from demorec.check.report import CheckOptions, check_subjects, find_subjects
 from demorec.datasets.lerobot.export import export_lerobot
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.options import ExportOptions
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import episode_digests
 from demorec.extensions.doctor.evidence import Evidence
 
 

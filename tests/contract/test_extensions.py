@@ -16,6 +16,7 @@ import pytest
 from support.export import data_table
 
 from demorec.core.extension import extensions
+from demorec.extensions.datasets.inspect import dataset_digest
 from demorec.mcap import open_recording
 
 PACKAGE = Path(__file__).parents[1] / "support" / "lab_extension"
@@ -195,7 +196,7 @@ def test_broken_extensions_are_named_and_harm_nothing(site: Path, tmp_path: Path
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [name if name == "doctor" else pytest.param(name, marks=pytest.mark.long) for name in OWN]
+    "name", [name if name == "datasets" else pytest.param(name, marks=pytest.mark.long) for name in OWN]
 )
 def test_a_folder_can_be_deleted(name: str, tmp_path: Path) -> None:
     """Without the folder and its dependents, the rest is imported and works, and no list or help mentions it."""
@@ -225,6 +226,19 @@ def test_a_folder_can_be_deleted(name: str, tmp_path: Path) -> None:
     assert "--append" in told
     assert not any(flag in told for flag in flags)
     out = tmp_path / "run"
-    words = ["--num-episodes", 1, "--cameras", "none", "--workers", 1, "--no-export", "--out", out]
-    assert "none failed" in demorec(tmp_path, *words, program=GENERATE)
+    words = ["--cameras", "none", "--workers", 1, "--out", out, *(() if name == "datasets" else ("--no-export",))]
+    assert "none failed" in demorec(tmp_path, "--num-episodes", 1, *words, program=GENERATE)
     assert "pick_place" in demorec(tmp_path, "info", out)
+    if name != "datasets":
+        return
+    dataset, unread = out / "dataset", "found a LeRobot dataset, which no installed extension reads"
+    digest = json.loads((out / "run.json").read_text())["export"]["dataset_digest"]
+    assert digest == dataset_digest(dataset)
+    assert digest in demorec(tmp_path, "--num-episodes", 1, *words, program=GENERATE)
+    assert "moved to" in demorec(tmp_path, "--num-episodes", 2, *words, program=GENERATE)
+    assert dataset_digest(out / "unfinished" / "dataset") == digest
+    for command in ("info", "view"):
+        assert unread in demorec(tmp_path, command, dataset, code=2)
+    append = ("export", "lerobot", out, "--out", dataset, "--append")
+    assert "No installed extension reads a dataset to append to" in demorec(tmp_path, *append, code=2)
+    assert "episode_000001" in demorec(tmp_path, "view", out, "--save", tmp_path / "episode.rrd")

@@ -12,7 +12,7 @@ _MODULES = (
     "demorec.check.run", "demorec.extensions.imports.suggest", "demorec.extensions.imports.import_run",
     "demorec.extensions.imports.dataset_import",
     "demorec.extensions.imports.hdf5_import", "demorec.extensions.imports.hdf5_suggest",
-    "demorec.datasets.lerobot.inspect",
+    "demorec.extensions.datasets.inspect",
     "demorec.datasets.lerobot.export", "demorec.extensions.hdf5.export", "demorec.extensions.report.gather",
     "demorec.extensions.policies.rollouts", "ruamel.yaml", "google.protobuf.descriptor_pool",
 )  # fmt: skip

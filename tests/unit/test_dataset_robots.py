@@ -19,12 +19,13 @@ from support.export import data_table, export
 from support.external import TOP, URDF, Episode, make_external, write_external
 
 from demorec.core.errors import MissingDependencyError
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.robots import portable_urdf, read_robot
+from demorec.datasets.lerobot.robots import portable_urdf
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.playback import open_dataset_episode
+from demorec.extensions.datasets.robots import read_robot
 from demorec.extensions.imports.dataset_import import import_lerobot
 from demorec.mcap import Recording
 from demorec.view import bodies as played_robot
-from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.scene import save
 from demorec.view.sources import find_episodes
 

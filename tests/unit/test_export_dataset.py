@@ -17,8 +17,8 @@ from support.recording import make_episode, write_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.datasets.options import parse_episodes
+from demorec.extensions.datasets.inspect import dataset_digest
 from demorec.mcap import Recording
 
 

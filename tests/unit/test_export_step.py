@@ -12,7 +12,7 @@ from support.export import export, files_of, make_run, without_verification
 
 from demorec.core.config import GenerateConfig, deciding_versions
 from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot.inspect import dataset_digest
+from demorec.extensions.datasets.inspect import dataset_digest
 from demorec.generate.export_step import export_run
 from demorec.runs.run_file import GeneratedRun, load_run_file, save_run_file
 

@@ -13,9 +13,9 @@ from support.recording import write_episode
 
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.playback import open_dataset_episode
 from demorec.mcap import Recording
-from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.scene import save
 from demorec.view.sources import find_episodes
 

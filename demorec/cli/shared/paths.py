@@ -1,5 +1,5 @@
 """Inputs of commands: their paths, the places where a command must not write because it reads them, and the flags by
-which users name features' roles and an arm's servos.
+which users name features' roles.
 """
 
 from __future__ import annotations
@@ -14,11 +14,10 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from demorec.cli.shared.output import renamed, tell
 from demorec.core.errors import ConfigError, DemorecError
-from demorec.core.extension import reader_rows
+from demorec.core.extension import KindRow, ReaderRow, kind_rows, reader_rows
 from demorec.core.processes import terminate_as_interrupt
 from demorec.core.replacing import json_object, use_as_source
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
-from demorec.robots.motors import Motors, MotorUnits
 from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, exported_kind, find
 from demorec.runs.foreign import import_kind, opened
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED, load_any_run_file
@@ -26,8 +25,8 @@ from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHE
 if TYPE_CHECKING:
     from demorec.episode.roles import NamedRoles
 
-_FOREIGN = [row.plural for kind, row in reader_rows().items() if kind != "dataset"]
-WHAT_IS_READ = ", ".join(["recordings", "runs", "LeRobot datasets", *_FOREIGN, "folders of these"])
+_READ: dict[str, KindRow | ReaderRow] = {**kind_rows(), **reader_rows()}
+WHAT_IS_READ = ", ".join(["recordings", "runs", *(row.plural for row in _READ.values()), "folders of these"])
 Readable = Annotated[Positional[tuple[Path, ...]], arg(help=f"Any of: {WHAT_IS_READ}.")]
 MappingFile = Annotated[
     Path | None,
@@ -163,29 +162,3 @@ class RoleFlags:
 
 
 NamedByFlags = Annotated[RoleFlags, arg(name="")]
-
-
-@dataclass(frozen=True, kw_only=True)
-class MotorFlags:
-    """The servos of a real arm whose values LeRobot recorded as state and action."""
-
-    motor_units: MotorUnits | None = None
-    """Joint units of a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): degrees,
-    LeRobot's default, or -100..100 of each joint's range. The dataset does not record the units.
-    """
-    calibration: Path | None = None
-    """With --motor-units: LeRobot's calibration file of the arm (auto: an arm that matches its URDF)."""
-
-    @property
-    def named(self) -> Motors | None:
-        """The servos; None without --motor-units. Raises ConfigError if the calibration does not match them."""
-        from demorec.robots.so101 import SO101_FOLLOWER
-
-        if self.motor_units is not None:
-            return SO101_FOLLOWER.motors(self.motor_units, self.calibration)
-        if self.calibration is not None:
-            raise ConfigError("--calibration belongs to --motor-units.")
-        return None
-
-
-MotorsByFlags = Annotated[MotorFlags, arg(name="")]

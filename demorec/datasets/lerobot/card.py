@@ -11,15 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from demorec.core.text import markdown
-from demorec.datasets.lerobot.episode_places import read_tasks
 from demorec.datasets.lerobot.files import read_table, tables_in, write_text
-from demorec.datasets.lerobot.layout import DatasetInfo
+from demorec.datasets.lerobot.layout import TASKS_PATH, DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, SIDECAR_DIR
-from demorec.episode.features import (
-    ACTION,
-    ActionKind,
-)
+from demorec.episode.features import ACTION, ActionKind
 
 _MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
 """Last line of a card; its digest reveals whether the card was edited."""
@@ -123,7 +119,7 @@ def _card(root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mappi
     for key, item in info.features.items():
         name = f"`{key}`" if markdown(key) == key else markdown(key)
         features.append(f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {meaning.get(key, '')} |")
-    tasks = read_tasks(root)
+    tasks = read_table(root / TASKS_PATH, ["task"]).column("task").to_pylist()
     listed = [f"- {markdown(task)}" for task in tasks[:_MAX_TASKS]]
     if len(tasks) > _MAX_TASKS:
         listed.append(f"- and {len(tasks) - _MAX_TASKS} more")

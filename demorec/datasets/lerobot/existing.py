@@ -6,80 +6,26 @@ Existing files are never opened for writing; new episodes get new files, as with
 from __future__ import annotations
 
 import os
-import shlex
 import shutil
-from collections.abc import Mapping
-from dataclasses import replace
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
-from demorec.core.errors import ConfigError, ExportError, describe_error
+from demorec.core.errors import ConfigError
+from demorec.core.extension import kind_function
 from demorec.core.replacing import files_below
-from demorec.datasets.lerobot.files import open_table, read_json, tables_in
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.layout import (
-    AUTOMATIC_FEATURES,
-    CODEBASE_VERSION,
-    STATS_PATH,
-    TASKS_PATH,
-    DatasetInfo,
-)
-from demorec.datasets.lerobot.paths import INFO_PATH, PROGRESS_PATH
-from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
-from demorec.datasets.lerobot.stats import NAMES, Statistics
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetInfo
+from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.writer import DatasetStart
 
-_CONVERT = "demorec dataset select {} --where 'num_frames > 0' --out NEW"
-"""Command that writes all episodes in the current format."""
 
-
-def start_after(folder: LeRobotFolder) -> DatasetStart:
-    """Read the state that a writer needs to continue a dataset. Raises ExportError if it has another format, or is
-    incomplete, and ConfigError if it has progress.
+def start_after(root: Path) -> DatasetStart:
+    """Read the state that a writer needs to continue a dataset. Raises ConfigError if no installed extension reads
+    datasets, and errors as in the extension.
     """
-    root, info = folder.root, folder.info
-    if info.is_old:
-        raise ExportError(
-            f"The dataset has format {info.version}, and only {CODEBASE_VERSION} can be appended to. This converts it "
-            f"to {CODEBASE_VERSION}: {_CONVERT.format(shlex.quote(str(root)))}"
-        )
-    if (root / PROGRESS_PATH).exists():
-        raise ConfigError(f"{PROGRESS_PATH} has no progress of new episodes: remove it, or export all again: {root}")
-    episodes, frames = len(folder.places), sum(place.length for place in folder.places)
-    rows = sum(open_table(path).metadata.num_rows for path in tables_in(root, "data"))
-    if rows != frames:
-        raise ExportError(
-            f"The dataset is incomplete: its episodes have {frames} frames, its data files {rows}: {root}"
-        )
-    keys = [name for name, feature in info.features.items() if feature.is_numeric or feature.is_camera]
-    needed = [f"stats/{key}/{name}" for key in keys for name in NAMES]
-    for path in folder.episode_tables:
-        if absent := [name for name in needed if name not in open_table(path).schema_arrow.names]:
-            raise ExportError(
-                f"The table of episodes lacks columns that new episodes have, such as {absent[0]}. This adds them: "
-                f"{_CONVERT.format(shlex.quote(str(root)))}"
-            )
-    try:
-        tasks = tuple(folder.tasks) if info.total_tasks else ()
-        found = folder.statistics if (root / STATS_PATH).exists() else {}
-        configs = read_json(root / CONFIGS_PATH) if (root / CONFIGS_PATH).exists() else {}
-        statistics = {key: part for key in info.video_keys if (part := _statistics(found, key, info)) is not None}
-        if not isinstance(configs, dict) or not all(isinstance(config, dict) for config in configs.values()):
-            raise ValueError(f"{CONFIGS_PATH} holds no configurations")
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise ExportError(f"The dataset cannot be read ({describe_error(error)}): {root}") from error
-    info = replace(info, total_episodes=episodes, total_frames=frames)  # other writers store some as 30.0
-    return DatasetStart(info=info, facts=folder.fact_types, tasks=tasks, statistics=statistics, configs=configs)
-
-
-def _statistics(found: Mapping[str, Any], key: str, info: DatasetInfo) -> Statistics | None:
-    part = Statistics.from_json(found.get(key, {}))
-    if part is None:
-        return None
-    if any(value.shape != info.features[key].shape[-1:] for value in part.values.values()) or part.count < 0:
-        raise ValueError(f"the statistics of {key} do not match its images")
-    # LeRobot's streaming writer counts pixels; for merging, a frame must count as one.
-    return Statistics(values=part.values, count=min(part.count, info.total_frames), is_camera=True)
+    if (read := kind_function("dataset", "appender")) is None:
+        raise ConfigError(f"No installed extension reads a dataset to append to: export into a new folder: {root}")
+    start: DatasetStart = read(root)
+    return start
 
 
 def features_to_append(root: Path, info: DatasetInfo, new: DatasetInfo) -> tuple[str, ...]:
@@ -122,10 +68,7 @@ def link_files(source: Path, target: Path) -> None:
 
 def _link_or_copy(path: Path, copy: Path) -> None:
     if path.suffix in (".parquet", ".mp4") and not path.is_symlink():
-        try:
+        with suppress(OSError):  # another file system, or one without links
             os.link(path, copy)
-        except OSError:
-            pass  # another file system, or one without links
-        else:
             return
     shutil.copy2(path, copy)

@@ -20,8 +20,6 @@ from demorec.core.replacing import shown
 from demorec.core.tables import EXTRA_FILES
 from demorec.datasets.lerobot.card import has_own_card, write_card
 from demorec.datasets.lerobot.existing import features_to_append, link_files, start_after
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import CODEBASE_VERSION, combined_digest
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, GROWING_DATASET
@@ -49,8 +47,8 @@ def export_lerobot(
     """
     options.validate()
     found = find_recordings(sources)
-    existing = LeRobotFolder(out) if options.append and out.exists() else None
-    export = _Export(found, options, existing)
+    existing = start_after(out) if options.append and out.exists() else None
+    export = _Export(found, out, options, existing)
     verifies = options.verify and lerobot_is_installed()
     kind, replace_it = (DATASET, options.overwrite) if existing is None else (GROWING_DATASET, True)
     with (
@@ -76,12 +74,12 @@ _ENCODED = ".encoded"
 
 
 class _Export:
-    def __init__(self, found: list[Path], options: ExportOptions, existing: LeRobotFolder | None) -> None:
+    def __init__(self, found: list[Path], out: Path, options: ExportOptions, existing: DatasetStart | None) -> None:
         self._found = found
+        self._out = out
         self._options = options
         self._existing = existing
-        self._begin = start_after(existing) if existing is not None else None
-        self._before = episode_digests(existing) if existing is not None else []
+        self._before = () if existing is None else existing.digests
         self._left_out: tuple[str, ...] = ()
         self._transcoded: dict[str, None] = {}
         self._digests: dict[Path, str] = {}
@@ -133,11 +131,10 @@ class _Export:
         return [(len(self._before) + index, paths[index]) for index in chosen]
 
     def _start(self, first: ExportedEpisode) -> DatasetStart:
-        existing, start = self._existing, self._begin
-        if existing is None or start is None:
+        if self._existing is None:
             return DatasetStart(info=first.info, configs={})
-        self._left_out = features_to_append(existing.root, start.info, first.info)
-        return start
+        self._left_out = features_to_append(self._out, self._existing.info, first.info)
+        return self._existing
 
     def _episodes(self, folder: Path, progress: ProgressCallback | None) -> Iterator[tuple[Path, ExportedEpisode]]:
         """Yield each selected recording and its episode in order; count the others, and compare the traits.

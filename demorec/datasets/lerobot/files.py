@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
-from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
 
@@ -27,22 +25,6 @@ _ROWS_AT_ONCE = 64
 _MAX_OPEN_TABLES = 16
 
 
-def leave_pandas_out() -> None:
-    """Make PyArrow work without pandas in this process. PyArrow would import pandas, which takes longer than most
-    edits, to check whether given lists are pandas objects.
-    """
-    finder = _NoPandas()
-    sys.meta_path.insert(0, finder)
-    pa.array([0])  # checks for pandas once and caches the result
-    sys.meta_path.remove(finder)
-
-
-class _NoPandas(MetaPathFinder):
-    def find_spec(self, fullname: str, path: Any, target: Any = None) -> None:
-        if fullname == "pandas":
-            raise ImportError
-
-
 def write_text(path: Path, text: str) -> None:
     """Write a new text file, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -54,18 +36,6 @@ def read_json(path: Path) -> Any:
     missing, not a regular file, or very large, and ValueError if it is not JSON, or nested too deeply.
     """
     return parse_json(read_text_limited(path, MAX_JSON_BYTES), allow_nan=True)
-
-
-def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """Read the objects of a JSON Lines file; ExportError if it cannot be read, or a line is not an object."""
-    try:
-        lines = read_text_limited(path, MAX_JSON_BYTES).splitlines()
-        found = [parse_json(line, allow_nan=True) for line in lines if line.strip()]
-        if not all(isinstance(line, dict) for line in found):
-            raise ValueError("a line is not an object")
-    except (OSError, ValueError) as error:
-        raise ExportError(f"The table cannot be read ({describe_error(error)}): {path}") from error
-    return found
 
 
 def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFile:
@@ -83,6 +53,18 @@ def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFi
     if missing:
         raise ExportError(f"The table has no column {', '.join(sorted(missing))}: {path}")
     return table
+
+
+def check_tables(root: Path) -> None:
+    """Read the ends of all tables and the JSON files. Raises ExportError for an empty or truncated one."""
+    for file in sorted(root.rglob("*")):
+        try:
+            if file.suffix == ".parquet":
+                open_table(file)
+            elif file.suffix == ".json":
+                read_json(file)
+        except (OSError, ValueError) as error:
+            raise ExportError(f"The dataset is damaged ({describe_error(error)}): {file}") from error
 
 
 def tables_in(root: Path, place: str) -> list[Path]:
@@ -165,6 +147,13 @@ def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.S
     batches = list(table_batches(path, columns))
     with _table_errors(path):
         return pa.Table.from_batches(batches, schema=batches[0].schema if batches else found)
+
+
+def column_values(column: pa.Array) -> NDArray[Any]:
+    """Convert a column to (T, D) numbers, or (T, 1) texts."""
+    if str(column.type) in ("string", "large_string"):
+        return np.array(column.to_pylist(), dtype=np.str_).reshape(-1, 1)
+    return column_numbers(column)
 
 
 def column_numbers(column: pa.Array) -> NDArray[Any]:

@@ -14,29 +14,21 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from demorec.core.errors import ExportError, describe_error
-from demorec.core.files import read_text_limited
-from demorec.core.plain import digest, from_json, leave_out_default, to_json
-from demorec.core.tables import ROBOTS
-from demorec.datasets.lerobot.files import MAX_JSON_BYTES, write_text
+from demorec.core.plain import digest, leave_out_default, to_json
+from demorec.datasets.lerobot.files import write_text
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.episode.element_names import joint_of
 from demorec.episode.features import ACTION, EE_POSE, STATE
 from demorec.episode.info import Feature
 from demorec.robots.motors import Motors
 from demorec.robots.so101 import SO101_FOLLOWER
-from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml
+from demorec.robots.urdf import Urdf, parse_xml
 
 if TYPE_CHECKING:
     from demorec.datasets.episode import ExportEpisode
 
 ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
-
-_DIGEST = re.compile(r"[0-9a-f]{16}")
 IN_MOTOR_UNITS = {"so101": SO101_FOLLOWER}
 """Row of `ROBOTS` that LeRobot also drives, in other units -> LeRobot's arm."""
-_IN_METRES = "gripper.width"
-"""Name of a gripper's element in metres; LeRobot's own name is gripper.pos."""
 _KEPT = ("material", "link", "joint")
 """Parts of a URDF that place and draw links; the rest is for simulators and controllers, and contains many paths."""
 _IN_PACKAGE = re.compile(r"^(?:file:/*)?/.*/share/([^/]+/.+)$")
@@ -84,25 +76,6 @@ class DatasetRobot:
         """Joint tree; lengths are those of the arm at any scale."""
         return Urdf.parse(self.urdf)
 
-    def described(self, feature: Feature, usual_name: str = "") -> Feature:
-        """Return a feature with its joints, units and calibration, if they fit its elements.
-
-        Args:
-            feature: Description in the dataset.
-            usual_name: Name for the lookup if its own name is unknown; "" for none.
-        """
-
-        def fitting[T](found: Mapping[str, tuple[T, ...]]) -> tuple[T, ...]:
-            values = found.get(feature.name, found.get(usual_name, ()))
-            return values if len(values) == len(feature.names) else ()
-
-        return replace(
-            feature,
-            joints=fitting(self.joints),
-            units=fitting(self.units),
-            calibration=fitting(self.calibration),
-        )
-
 
 leave_out_default(DatasetRobot, "urdf")
 
@@ -125,41 +98,10 @@ def robot_of(episode: ExportEpisode[Any]) -> DatasetRobot | None:
     return DatasetRobot.of(info.robot_name, text, [state])
 
 
-@functools.cache
-def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
-    """Return the row of `ROBOTS` with joints named like the elements of observation.state, such as "panda_joint1.pos".
-    For datasets without a description of the robot; lengths are those of the model. LeRobot's own arms are left out
-    unless the gripper's name implies metres: their joints have the same names in degrees and in percent.
-    """
-    from demorec.mcap.description import robot_description  # loads all code for reading recordings
-
-    stems = [joint_of(name) for name in names]
-    for row in ROBOTS.names():
-        robot = ROBOTS.load(row)
-        if robot.name in IN_MOTOR_UNITS and _IN_METRES not in names:
-            continue
-        if set(robot.arm_joints) <= set(stems):
-            urdf = robot_description(robot.urdf, 1.0)
-            # An opening in metres is not a jaw angle.
-            known = zip(names, stems, strict=True)
-            joints = tuple(stem if stem in robot.joint_names and name != _IN_METRES else "" for name, stem in known)
-            return DatasetRobot.of(robot.name, urdf, [Feature(name=STATE, names=names, joints=joints)])
-    return None
-
-
 def motor_features(motors: Motors) -> tuple[Feature, ...]:
     """Describe state and action as LeRobot records them from a real arm."""
     known: Any = {"units": motors.units, "joints": motors.joints, "calibration": motors.to_positions}
     return tuple(Feature(name=name, names=motors.names, **known) for name in (STATE, ACTION))
-
-
-@functools.cache
-def robot_of_motors(motors: Motors) -> DatasetRobot:
-    """Return the arm with these servos."""
-    from demorec.mcap.description import robot_description  # loads all code for reading recordings
-
-    (model,) = (ROBOTS.load(name).urdf for name, arm in IN_MOTOR_UNITS.items() if arm.robot_type == motors.robot_type)
-    return DatasetRobot.of(motors.robot_type, robot_description(model, 1.0), motor_features(motors))
 
 
 @functools.lru_cache(maxsize=8)  # usually the same for all recordings of a run
@@ -193,24 +135,3 @@ def write_robot(root: Path, robot: DatasetRobot) -> None:
         path = folder / f"{robot.digest}{name}"
         if not path.exists():
             write_text(path, text)
-
-
-def read_robot(root: Path, name: str) -> DatasetRobot:
-    """Read the arm with this digest from a dataset. Raises ExportError if it is missing, has changed since it was
-    written, or cannot be used.
-    """
-    path = root / ROBOTS_DIR / f"{name}.json"
-    try:
-        if not _DIGEST.fullmatch(name):
-            raise ValueError(f"{name[:20]!r} is not a digest")
-        described = from_json(read_text_limited(path, MAX_JSON_BYTES), DatasetRobot)
-        robot = replace(described, urdf=read_text_limited(path.with_suffix(".urdf"), MAX_BYTES))
-        if robot.digest != name:
-            raise ValueError("it has changed since it was written")
-        joints = {joint.name for joint in robot.model.joints}
-        named = {joint for part in robot.joints.values() for joint in part if joint}
-        if missing := named - joints:
-            raise ValueError(f"its URDF lacks the joints {', '.join(sorted(missing))}")
-    except (OSError, ValueError) as error:
-        raise ExportError(f"The description of the robot cannot be read ({describe_error(error)}): {path}") from error
-    return robot

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import Closing
-from demorec.datasets.lerobot.files import tables_in, write_text
+from demorec.datasets.lerobot.files import column_values, tables_in, write_text
 from demorec.datasets.lerobot.language import REPEATING, column_digests, is_language
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -37,7 +37,6 @@ from demorec.datasets.lerobot.layout import (
 from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer
 from demorec.datasets.lerobot.parquet import RollingParquet, next_position, vector_array
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.datasets.lerobot.rows import column_values
 from demorec.datasets.lerobot.sidecar import EpisodeRecord, SidecarWriter
 from demorec.datasets.lerobot.stats import (
     NAMES,
@@ -99,6 +98,7 @@ class DatasetStart:
         tasks: Existing instructions in the order of their indices.
         statistics: Statistics of the camera features over the existing episodes.
         configs: Config digest -> configuration, of the existing episodes; None for a dataset without a sidecar.
+        digests: Content digests of the existing episodes, in order.
     """
 
     info: DatasetInfo
@@ -106,6 +106,7 @@ class DatasetStart:
     tasks: Sequence[str] = ()
     statistics: Mapping[str, Statistics] = field(default_factory=dict)
     configs: Mapping[str, Any] | None = None
+    digests: Sequence[str] = ()
 
 
 class DatasetWriter(Closing):

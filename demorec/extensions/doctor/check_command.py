@@ -14,8 +14,6 @@ from demorec.cli.shared.flags import Allow, Positional, allowed_modules, termina
 from demorec.cli.shared.output import ProgressBar, counted, say, say_json
 from demorec.cli.shared.paths import (
     MappingFile,
-    MotorFlags,
-    MotorsByFlags,
     NamedByFlags,
     Readable,
     RoleFlags,
@@ -25,6 +23,8 @@ from demorec.cli.shared.paths import (
 )
 from demorec.core.errors import ConfigError, describe_error
 from demorec.core.registry import nearest_match
+from demorec.core.tables import FILE_CHECKS
+from demorec.extensions.datasets.command import MotorFlags, MotorsByFlags
 from demorec.extensions.doctor.examine import examine, lines_of
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class CheckCommand:
     def _check(self) -> int:
         from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
         from demorec.core.processes import available_cores
-        from demorec.datasets.lerobot.files import leave_pandas_out
+        from demorec.extensions.datasets.command import leave_pandas_out
 
         leave_pandas_out()
         integrity, chosen = split_checks(self.only)
@@ -249,8 +249,6 @@ class Explain:
 
     def run(self) -> int:
         """Print the page of the check."""
-        from demorec.core.tables import FILE_CHECKS
-
         _, doctors = split_checks((self.check,))
         found = doctors[0] if doctors else FILE_CHECKS.load(self.check)
         width = min(terminal_width(), 100)
@@ -274,7 +272,6 @@ def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[Check, ..
     Raises:
         ConfigError: Unknown check.
     """
-    from demorec.core.tables import FILE_CHECKS
     from demorec.extensions.doctor.checks import all_checks
 
     if not names:
@@ -289,7 +286,6 @@ def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[Check, ..
 
 def check_rows() -> Iterator[tuple[str, str]]:
     """Yield (name, summary) of every check, the doctor's first."""
-    from demorec.core.tables import FILE_CHECKS
     from demorec.extensions.doctor.checks import all_checks
 
     for check in all_checks():

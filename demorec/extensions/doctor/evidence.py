@@ -19,7 +19,7 @@ from demorec.episode.roles import Roles
 from demorec.extensions.doctor.robust import without_gaps
 
 if TYPE_CHECKING:
-    from demorec.datasets.lerobot.folder import LeRobotFolder
+    from demorec.extensions.datasets.folder import LeRobotFolder
     from demorec.extensions.doctor.thumbnails import CameraThumbnails
 
 Flags = NDArray[np.bool_]
@@ -120,12 +120,7 @@ class Evidence:
     @cached_property
     def elements(self) -> tuple[str, ...]:
         """Names of the D elements of the state."""
-        return self.roles.elements(self.roles.state) if self.roles.state else ()
-
-    @cached_property
-    def action_elements(self) -> tuple[str, ...]:
-        """Names of the K elements of the action."""
-        return self.roles.elements(self.roles.action) if self.roles.action else ()
+        return self.roles.elements(self.roles.state)
 
     @cached_property
     def is_gripper(self) -> Flags:
@@ -145,11 +140,8 @@ class Evidence:
         """Index in the action of each element of the state, for "x" also "delta_x" or "x.delta"; None if missing."""
         if not (self.roles.state and self.roles.action):
             return [None] * len(self.elements)
-        increments = {
-            _INCREMENT.sub("", name): place
-            for place, name in enumerate(self.action_elements)
-            if _INCREMENT.search(name)
-        }
+        actions = enumerate(self.roles.elements(self.roles.action))
+        increments = {_INCREMENT.sub("", name): place for place, name in actions if _INCREMENT.search(name)}
         matched = self.roles.in_state(self.roles.action)
         return [
             increments.get(joint_of(name)) if place is None else place

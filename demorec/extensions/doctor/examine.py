@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING
 
 from demorec.check.base import Finding
 from demorec.cli.shared.output import counted
+from demorec.core.errors import ExportError
+from demorec.runs.find import find
+from demorec.runs.run_file import DATASET
 
 if TYPE_CHECKING:
     from demorec.check.base import Check
@@ -43,10 +46,8 @@ def examine(
         checks: Checks to run; all by default.
         earlier: Sets named before it.
     """
-    from demorec.core.errors import ExportError
     from demorec.extensions.doctor.checks import all_checks
     from demorec.extensions.doctor.diagnosis import Diagnosis, diagnose
-    from demorec.runs.find import find
 
     chosen = all_checks() if checks is None else checks
     extra = list(_of_files(reports))
@@ -57,9 +58,8 @@ def examine(
         others = [finding for finding in extra if unopened.message not in finding.message]
         return Diagnosis(path=path, taken={}, findings=(unopened, *others), episodes=(), not_measured={}), None
     evidence.earlier = earlier
-    found = find(path)
     diagnosis = diagnose(evidence, chosen, extra)
-    if found.kind == "run" and evidence.folder is None:
+    if find(path).kind == "run" and evidence.folder is None:
         diagnosis = _with_dataset(diagnosis, path, options, chosen)
     results = [result for report in reports for result in report.results]
     not_measured = {
@@ -73,7 +73,6 @@ def examine(
 def _evidence(path: Path, options: ReadOptions) -> Evidence:
     from demorec.extensions.doctor.from_dataset import evidence_of_dataset
     from demorec.extensions.doctor.from_recordings import evidence_of_recordings
-    from demorec.runs.find import find
 
     found = find(path)
     if found.kind == "dataset":
@@ -84,11 +83,8 @@ def _evidence(path: Path, options: ReadOptions) -> Evidence:
 
 def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen: Sequence[Check]) -> Diagnosis:
     """Add the findings about the files of a run's own dataset; its numbers and images are those of the recordings."""
-    from demorec.core.errors import ExportError
     from demorec.extensions.doctor.diagnosis import diagnose
     from demorec.extensions.doctor.from_dataset import evidence_of_dataset, no_progress
-    from demorec.runs.find import find
-    from demorec.runs.run_file import DATASET
 
     path = run / DATASET
     if find(path).kind != "dataset":

@@ -7,7 +7,7 @@ from demorec.core.extension import CommandRow, Extension
 EXTENSION = Extension(
     name="doctor",
     summary="judge datasets, runs and recordings before training",
-    needs=("remake",),
+    needs=("datasets", "remake"),
     commands={
         "check": CommandRow(
             target="demorec.extensions.doctor.check_command:CheckCommand",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import count, groupby
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import noted, usable_numbers
-from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
-from demorec.datasets.lerobot.videos import opened_video
+from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.features import STATE
+from demorec.episode.info import Feature
 from demorec.episode.roles import NO_NAMES, NamedRoles
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import noted, usable_numbers
+from demorec.extensions.datasets.robots import described, recognised_robot, robot_of_motors
+from demorec.extensions.datasets.videos import opened_video
 from demorec.extensions.doctor.diagnosis import diagnose
 from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence, continuous, joined
-from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails, Shrinker, frames_of
+from demorec.extensions.doctor.thumbnails import CameraThumbnails, Shrinker, frames_of
 from demorec.robots.motors import Motors
 from demorec.runs.find import find
 
@@ -50,20 +52,6 @@ class ReadOptions:
     progress: Callable[[int, int], None] = no_progress
 
 
-@dataclass(kw_only=True)
-class PartCounter:
-    """Counter of the parts that have been read: an episode's rows, or its images of one camera."""
-
-    total: int
-    progress: Callable[[int, int], None]
-    done: int = 0
-
-    def advance(self) -> None:
-        """Count one more part."""
-        self.done += 1
-        self.progress(self.done, self.total)
-
-
 def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
     """Read a dataset; unreadable data excludes only its episode.
 
@@ -75,19 +63,22 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
     roles = folder.roles
     readable: list[EpisodeEvidence] = []
     unreadable: dict[int, str] = {}
-    elements = roles.elements(roles.state) if roles.state else ()
-    acted = roles.elements(roles.action) if roles.action else ()
+    elements = roles.elements(roles.state)
     robot_problems: list[str] = []
     robot: DatasetRobot | None = None
     with noted(robot_problems, root):
         robot = _robot(folder, options, elements)
-    joints = _joints(robot, folder, elements)
-    in_si = robot is not None and not options.urdf
+    units = None if options.urdf else robot
     reader = folder.rows([name for name in folder.columns if folder.info.features[name].dtype != "image"])
     cameras = _camera_names(folder) if options.images else []
-    parts = PartCounter(total=len(folder.listed) * (1 + len(cameras)), progress=options.progress)
+    total, done = len(folder.listed) * (1 + len(cameras)), count(1)
+
+    def advance() -> None:
+        """Count an episode's rows, or its images of one camera, as read."""
+        options.progress(next(done), total)
+
     for place in folder.listed:
-        parts.advance()
+        advance()
         problems: list[str] = []
         columns: Mapping[str, NDArray[Any]] = {}
         with noted(problems, root):
@@ -95,14 +86,14 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
         if problems:
             unreadable[place.episode_index] = problems[0]
             continue
-        in_units = _in_si(columns, robot, roles.state, roles.action) if in_si else columns
+        in_units = columns if units is None else _in_si(columns, units, roles.state, roles.action)
         readable.append(
             EpisodeEvidence(
                 number=place.episode_index,
                 instruction="; ".join(place.tasks),
                 columns=columns,
                 state=continuous(joined(roles.state, in_units), elements),
-                action=continuous(joined(roles.action, in_units), acted),
+                action=continuous(joined(roles.action, in_units), roles.elements(roles.action)),
                 time_s=columns["timestamp"][:, 0].astype(np.float64) if "timestamp" in columns else None,
             )
         )
@@ -113,11 +104,11 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
         episodes=readable,
         unreadable=unreadable,
         folder=folder,
-        cameras=_cameras(folder, cameras, unreadable, parts),
+        cameras=_cameras(folder, cameras, unreadable, advance),
         images_missing=_why_no_images(folder) if options.images else "images are not decoded (--no-images)",
         urdf=options.urdf or ("" if robot is None else robot.urdf),
         robot_problem="; ".join(robot_problems),
-        arm_joints=joints,
+        arm_joints=_joints(robot, folder, elements),
         opens_lerobot=options.lerobot,
     )
 
@@ -141,30 +132,22 @@ def _joints(robot: DatasetRobot | None, folder: LeRobotFolder, elements: tuple[s
 
 
 def _in_si(
-    columns: Mapping[str, NDArray[Any]], robot: DatasetRobot | None, *parts: tuple[str, ...]
+    columns: Mapping[str, NDArray[Any]], robot: DatasetRobot, state: Sequence[str], action: Sequence[str]
 ) -> Mapping[str, NDArray[Any]]:
     """Convert state and action columns to rad and m, by the units in the robot's record."""
-    assert robot is not None
-    from demorec.episode.info import Feature
-
     found = dict(columns)
-    for name in (name for part in parts for name in part):
+    for name in (*state, *action):
         width = columns[name].shape[1]
-        usual_name = "action" if name in parts[1] else STATE
-        feature = robot.described(Feature(name=name, names=tuple(map(str, range(width)))), usual_name)
+        usual_name = "action" if name in action else STATE
+        feature = described(robot, Feature(name=name, names=tuple(map(str, range(width)))), usual_name)
         found[name] = feature.in_si(columns[name])
     return found
-
-
-def _is_absent(folder: LeRobotFolder, key: str) -> bool:
-    """Check whether all of a camera's video files are missing, as after a download of the tables alone."""
-    return not any(place.videos[key][0].exists() for place in folder.listed)
 
 
 def _why_no_images(folder: LeRobotFolder) -> str:
     """Explain why no image is examined because all video files are missing; "" if some exist, or no cameras."""
     keys = folder.info.video_keys
-    if keys and all(_is_absent(folder, key) for key in keys):
+    if keys and all(folder.is_absent(key) for key in keys):
         return f"no video of {', '.join(keys)} is here; download them"
     return ""
 
@@ -174,33 +157,26 @@ def _camera_names(folder: LeRobotFolder) -> list[str]:
     return [
         key
         for key, feature in folder.info.features.items()
-        if feature.is_camera and not feature.is_depth and not (feature.is_video and _is_absent(folder, key))
+        if feature.is_camera and not feature.is_depth and not (feature.is_video and folder.is_absent(key))
     ]
 
 
 def _cameras(
-    folder: LeRobotFolder, keys: Sequence[str], unreadable: Collection[int], parts: PartCounter
+    folder: LeRobotFolder, keys: Sequence[str], unreadable: Collection[int], advance: Callable[[], None]
 ) -> dict[str, CameraThumbnails]:
     found = {}
     for key in keys:
-        episodes: dict[int, EpisodeThumbnails] = {}
-        errors: dict[int, str] = {}
+        images = CameraThumbnails()
         if folder.info.features[key].is_video:
-            _read_videos(folder, key, episodes, errors, parts)
+            _read_videos(folder, key, images, advance)
         else:
-            _read_stored(folder, key, unreadable, episodes, errors, parts)
-        if episodes or errors:
-            found[key] = CameraThumbnails(episodes=episodes, errors=errors)
+            _read_stored(folder, key, unreadable, images, advance)
+        if images.episodes or images.errors:
+            found[key] = images
     return found
 
 
-def _read_videos(
-    folder: LeRobotFolder,
-    key: str,
-    episodes: dict[int, EpisodeThumbnails],
-    errors: dict[int, str],
-    parts: PartCounter,
-) -> None:
+def _read_videos(folder: LeRobotFolder, key: str, images: CameraThumbnails, advance: Callable[[], None]) -> None:
     """Decode a camera's videos, each file in one pass."""
     shrinker = Shrinker()
     for path, group in groupby(folder.listed, key=lambda place: place.videos[key][0]):
@@ -208,32 +184,29 @@ def _read_videos(
         problems: list[str] = []
         with noted(problems, folder.root), opened_video(path) as opened:
             for place in places:
-                parts.advance()
+                advance()
                 own: list[str] = []
                 with noted(own, folder.root):
-                    episodes[place.episode_index] = shrinker.shrink(folder.video(key, place).decoded(opened=opened))
+                    decoded = folder.video(key, place).decoded(opened=opened)
+                    images.episodes[place.episode_index] = shrinker.shrink(decoded)
                 if own:
-                    errors[place.episode_index] = own[0]
+                    images.errors[place.episode_index] = own[0]
         if problems:
-            errors |= {place.episode_index: problems[0] for place in places if place.episode_index not in episodes}
+            missing = [place.episode_index for place in places if place.episode_index not in images.episodes]
+            images.errors.update(dict.fromkeys(missing, problems[0]))
 
 
 def _read_stored(
-    folder: LeRobotFolder,
-    key: str,
-    unreadable: Collection[int],
-    episodes: dict[int, EpisodeThumbnails],
-    errors: dict[int, str],
-    parts: PartCounter,
+    folder: LeRobotFolder, key: str, unreadable: Collection[int], images: CameraThumbnails, advance: Callable[[], None]
 ) -> None:
     shrinker = Shrinker()
     for place in (place for place in folder.listed if place.episode_index not in unreadable):
-        parts.advance()
+        advance()
         problems: list[str] = []
         with noted(problems, folder.root):
-            episodes[place.episode_index] = shrinker.shrink(frames_of(folder.stored_images[key].read(place)))
+            images.episodes[place.episode_index] = shrinker.shrink(frames_of(folder.stored_images[key].read(place)))
         if problems:
-            errors[place.episode_index] = problems[0]
+            images.errors[place.episode_index] = problems[0]
 
 
 def judged_columns(folder: LeRobotFolder, names: Collection[str]) -> list[dict[str, Any]]:

@@ -16,7 +16,7 @@ from demorec.episode.protocol import Episode
 from demorec.episode.roles import COUNTERS, Column, NamedRoles, Roles, find_roles, roles_of_recording
 from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence, continuous, joined
 from demorec.extensions.doctor.from_dataset import ReadOptions
-from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails, Shrinker, frames_of
+from demorec.extensions.doctor.thumbnails import CameraThumbnails, Shrinker, frames_of
 from demorec.mcap import open_recording
 
 _NANOSECONDS = 1e9
@@ -35,8 +35,7 @@ def evidence_of_recordings(path: Path, files: Sequence[Path], options: ReadOptio
     """
     episodes: list[EpisodeEvidence] = []
     unreadable: dict[int, str] = {}
-    images: dict[str, dict[int, EpisodeThumbnails]] = {}
-    errors: dict[str, dict[int, str]] = {}
+    images: dict[str, CameraThumbnails] = {}
     first: EpisodeInfo | None = None
     roles: Roles | None = None
     urdf = options.urdf
@@ -51,8 +50,7 @@ def evidence_of_recordings(path: Path, files: Sequence[Path], options: ReadOptio
                 table = recording.table()
                 episodes.append(_episode(number, recording, table, roles))
                 for camera in recording.cameras if options.images else ():
-                    seen, failed = images.setdefault(camera, {}), errors.setdefault(camera, {})
-                    _read_images(number, recording, table, camera, seen, failed)
+                    _read_images(number, recording, table, camera, images.setdefault(camera, CameraThumbnails()))
         except DemorecError as error:
             if (lack := resource_error(error)) is not None:
                 raise lack from error
@@ -65,7 +63,7 @@ def evidence_of_recordings(path: Path, files: Sequence[Path], options: ReadOptio
         roles=_with_cameras(roles, images),
         episodes=episodes,
         unreadable=unreadable,
-        cameras={camera: CameraThumbnails(episodes=images[camera], errors=errors[camera]) for camera in images},
+        cameras=images,
         images_missing="" if options.images else "images are not decoded (--no-images)",
         urdf=urdf,
         arm_joints=joints if any(joints) else (),
@@ -105,22 +103,15 @@ def _episode(number: int, recording: Episode, table: Table, roles: Roles) -> Epi
         number=number,
         instruction=info.instruction,
         columns=columns,
-        state=continuous(joined(roles.state, in_si), roles.elements(roles.state) if roles.state else ()),
-        action=continuous(joined(roles.action, in_si), roles.elements(roles.action) if roles.action else ()),
+        state=continuous(joined(roles.state, in_si), roles.elements(roles.state)),
+        action=continuous(joined(roles.action, in_si), roles.elements(roles.action)),
         time_s=table.time_ns / _NANOSECONDS,
         image_ages_s=ages if info.simulation is None else {},
         drops=", ".join(f"{count} of {what}" for what, count in drops.items() if count),
     )
 
 
-def _read_images(
-    number: int,
-    recording: Episode,
-    table: Table,
-    camera: str,
-    episodes: dict[int, EpisodeThumbnails],
-    errors: dict[int, str],
-) -> None:
+def _read_images(number: int, recording: Episode, table: Table, camera: str, into: CameraThumbnails) -> None:
     """Decode the images of a camera; each belongs to the first frame that shows it."""
     if camera not in table.images:
         return
@@ -129,8 +120,8 @@ def _read_images(
     except DemorecError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        errors[number] = str(error)
+        into.errors[number] = str(error)
         return
     held, frames = np.unique(table.images[camera], return_index=True)
     shown = (held != NO_IMAGE) & (held < len(images.thumbnails))
-    episodes[number] = images.taken(held[shown], frames[shown])
+    into.episodes[number] = images.taken(held[shown], frames[shown])

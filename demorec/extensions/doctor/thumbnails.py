@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import av
@@ -64,8 +64,8 @@ class CameraThumbnails:
         errors: Number of an episode -> reason why its images do not decode.
     """
 
-    episodes: Mapping[int, EpisodeThumbnails] = field(default_factory=dict)
-    errors: Mapping[int, str] = field(default_factory=dict)
+    episodes: dict[int, EpisodeThumbnails] = field(default_factory=dict)
+    errors: dict[int, str] = field(default_factory=dict)
 
 
 class Shrinker:

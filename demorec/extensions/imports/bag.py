@@ -17,7 +17,7 @@ from pathlib import Path, PurePath
 import zstandard
 
 from demorec.core.errors import ConfigError, describe_error, resource_error
-from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited, sha256_of
+from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited
 from demorec.core.replacing import is_utf8
 from demorec.extensions.imports.bag_files import (
     MAX_TIME_NS,
@@ -67,10 +67,6 @@ class Bag:
     def num_bytes(self) -> int:
         """Size of its files."""
         return sum(file.stat().st_size for file in self.files)
-
-    def sha256s(self) -> Files:
-        """Digests of its files, which identify the bag."""
-        return tuple((path.name, sha256_of(path)) for path in self.files)
 
     def messages(self, problems: list[str], topics: Topics = None) -> Iterator[ScannedMessage]:
         """Read its messages, file after file.

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from demorec.cli.shared.flags import Positional, arg
 from demorec.cli.shared.output import ProgressBar, aligned, counted, say, size_in_words, tell
-from demorec.cli.shared.paths import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags, refuse_inside
+from demorec.cli.shared.paths import NamedByFlags, RoleFlags, refuse_inside
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.extension import ReaderRow, reader_rows
 from demorec.core.registry import nearest_match
 from demorec.core.replacing import OptionalTarget
+from demorec.extensions.datasets.command import MotorFlags, MotorsByFlags
 from demorec.runs.find import find
 
 if TYPE_CHECKING:

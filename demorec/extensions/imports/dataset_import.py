@@ -15,17 +15,17 @@ from pathlib import Path
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError, RecordingError, resource_error
 from demorec.core.files import sha256_of
-from demorec.datasets.lerobot.dataset_features import NOT_HELD, why_not_recorded
-from demorec.datasets.lerobot.episode_places import EpisodePlace
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import mistyped_features
 from demorec.datasets.lerobot.language import PERSISTENT
 from demorec.datasets.lerobot.layout import is_task_reference
 from demorec.datasets.lerobot.paths import BOXES_DIR, INFO_PATH, PROGRESS_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.datasets.options import select_episodes
 from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.episode.roles import NO_NAMES, NamedRoles
+from demorec.extensions.datasets.dataset_features import NOT_HELD, why_not_recorded
+from demorec.extensions.datasets.episode_places import EpisodePlace
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import mistyped_features
+from demorec.extensions.datasets.recording import DatasetRecording
 from demorec.extensions.imports.description import importing_versions
 from demorec.extensions.imports.episode_writer import FramesImport, Image, add_episode
 from demorec.extensions.recorder.external_run import ExternalFolder, episode_path, open_external_run, planned_episode

@@ -5,7 +5,7 @@ from demorec.core.extension import CommandRow, Extension, ReaderRow
 EXTENSION = Extension(
     name="imports",
     summary="convert bags, HDF5 files and LeRobot datasets to runs",
-    needs=("recorder", "recovery"),
+    needs=("datasets", "recorder", "recovery"),
     commands={"import": CommandRow(target="demorec.extensions.imports.command:Import", group="make", limits="reading")},
     readers={
         "rosbag": ReaderRow(

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, resource_error, without_path
+from demorec.core.files import sha256_of
 from demorec.core.plain import to_plain
 from demorec.extensions.imports.bag import Files, bags_in, open_bag
 from demorec.extensions.imports.bag_images import write_bag
@@ -67,7 +68,7 @@ class BagsImport:
             BagError, ConfigError: It cannot be read, or does not fit the mapping or the run.
         """
         bag = open_bag(path)
-        files = bag.sha256s()
+        files = tuple((file.name, sha256_of(file)) for file in bag.files)
         planned = None
         if files not in {report.files for report in self.known.bags}:
             planned = plan_bag(bag, files, settings, episode_index=len(self.known.bags))

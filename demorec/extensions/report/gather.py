@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from demorec.check.base import Finding
 from demorec.cli.shared.output import size_in_words
 from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.episode.element_names import is_numbered
 from demorec.episode.episode import Outcome
 from demorec.episode.protocol import Episode
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recording
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.recording import DatasetRecording
 from demorec.extensions.doctor.diagnosis import Diagnosis
 from demorec.extensions.policies.statistics import Rate
 from demorec.extensions.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip
@@ -276,11 +276,8 @@ def _read(
             strip = None
             if has_strip and cameras:
                 strip = filmstrip(cameras[0], episode.num_frames, partial(episode.images_at, cameras[0]))
-            add_motion(
-                components,
-                roles if isinstance(roles, Roles) else roles_of_recording(info, roles),
-                table.features,
-            )
+            own_roles = roles if isinstance(roles, Roles) else roles_of_recording(info, roles)
+            add_motion(components, own_roles, table.features)
             attempt = f", attempt {info.attempt}" if info.attempt or path.parent.name == FAILED else ""
             return ReportedEpisode(
                 name=f"episode {info.episode_index}{attempt}",

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Fault, NotApplicableError, Severity, check
 from demorec.datasets.lerobot.files import open_table, read_table
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import noted, range_errors, stored_dtype
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, TASKS_PATH, VIDEO_PATH, DatasetFeature
-from demorec.datasets.lerobot.videos import opened_video
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import noted, range_errors, stored_dtype
+from demorec.extensions.datasets.videos import opened_video
 from demorec.extensions.doctor.evidence import DROP, REPAIR, Evidence
 
 _STATED_TYPES = ("float32", "float64", "int64", "bool", "string")

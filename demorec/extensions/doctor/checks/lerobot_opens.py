@@ -13,8 +13,8 @@ from collections.abc import Iterator
 
 from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, check
 from demorec.core.errors import MissingDependencyError, ResourceError
-from demorec.datasets.lerobot.inspect import dataset_problems
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
+from demorec.extensions.datasets.inspect import dataset_problems
 from demorec.extensions.doctor.checks.files import folder_of
 from demorec.extensions.doctor.evidence import Evidence
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from demorec.check.base import Fault, NotMeasuredError, Severity, check
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import OLD_STATS
 from demorec.datasets.lerobot.layout import STATS_PATH
-from demorec.datasets.lerobot.statistic_errors import StatisticError, numbers_of, statistic_errors
 from demorec.datasets.lerobot.stats import NAMES
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import OLD_STATS
+from demorec.extensions.datasets.statistic_errors import StatisticError, numbers_of, statistic_errors
 from demorec.extensions.doctor.checks.files import folder_of
 from demorec.extensions.doctor.evidence import REPAIR, Evidence
 

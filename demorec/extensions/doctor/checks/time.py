@@ -169,7 +169,7 @@ def time_grid(evidence: Evidence) -> Iterator[Fault]:
     """Compare the timestamps of a dataset with frame_index / fps, as LeRobot does when it loads one."""
     if evidence.folder is None:
         raise NotApplicableError("recordings have their own timestamps")
-    from demorec.datasets.lerobot.episode_places import are_on_grid
+    from demorec.extensions.datasets.episode_places import are_on_grid
 
     worst: dict[int, float] = {}
     for episode, times in _timed(evidence):

@@ -70,11 +70,8 @@ def _items(data: Mapping[str, Any], section: str) -> list[tuple[str, Mapping[str
 
 def _groups(section: Mapping[str, Any], name: str) -> Iterator[_Group]:
     for group, entry in section.items():
-        feature, first, last = (
-            entry.get("original_key") or _DEFAULT_FEATURES[name],
-            entry.get("start"),
-            entry.get("end"),
-        )
+        feature = entry.get("original_key") or _DEFAULT_FEATURES[name]
+        first, last = entry.get("start"), entry.get("end")
         if not isinstance(feature, str) or type(first) is not int or type(last) is not int:
             raise ValueError(f"the group {group!r} of {name} has no start, end or feature")
         yield _Group(feature, group, first, last)

@@ -25,11 +25,11 @@ from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import open_regular
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
-from demorec.datasets.lerobot.episode_places import EpisodePlace
-from demorec.datasets.lerobot.layout import DatasetFeature, video_info
+from demorec.datasets.lerobot.layout import DatasetInfo, video_info
 from demorec.datasets.lerobot.mp4 import EncodedVideo, one_image_file
-from demorec.datasets.lerobot.mp4_index import check_video, mp4_index
 from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.extensions.datasets.episode_places import EpisodePlace
+from demorec.extensions.datasets.mp4_index import check_video, mp4_index
 
 if TYPE_CHECKING:
     from demorec.mcap.video import Rgb
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 PacketCodec = Literal["h264", "h265", "av1"]
 PACKET_CODECS: dict[str, PacketCodec] = {"h264": "h264", "hevc": "h265", "av1": "av1", "libdav1d": "av1"}
 """libav's name of a codec or decoder -> demorec's."""
-_MP4_NAMES = {"h265": "hevc"}
 _TO_START_CODES = {"h264": "h264_mp4toannexb", "h265": "hevc_mp4toannexb"}
 _TEMPORAL_DELIMITER = b"\x12\x00"
 """Precedes every temporal unit of AV1 (its specification, section 7.5); mp4 files leave it out."""
@@ -92,7 +91,7 @@ class VideoFile:
         with opened_video(path) as (_, stream):
             context = stream.codec_context
             self.codec: PacketCodec | Literal[""] = PACKET_CODECS.get(context.name, "")
-            self.codec_name = _MP4_NAMES.get(self.codec, self.codec) or context.name
+            self.codec_name = "hevc" if self.codec == "h265" else self.codec or context.name
             self.size, self.pixels = (context.width, context.height), context.pix_fmt or ""
             self.parameters = extra = context.extradata or b""
             length_size = extra[4] if self.codec == "h264" else extra[21] if len(extra) > 21 else 3
@@ -157,18 +156,16 @@ class EpisodeVideo:
     Methods and properties raise ExportError if the images cannot be read.
     """
 
-    def __init__(
-        self, open_file: Callable[[Path], VideoFile], key: str, place: EpisodePlace, feature: DatasetFeature, fps: int
-    ) -> None:
+    def __init__(self, opener: Callable[[Path], VideoFile], key: str, place: EpisodePlace, info: DatasetInfo) -> None:
         self.path, self.first = place.videos[key]
         self.length = place.length
-        self._open_file, self._key, self._feature, self._fps = open_file, key, feature, fps
+        self._opener, self._key, self._feature, self._fps = opener, key, info.features[key], int(info.fps)
         self._episode = place.episode_index
 
     @property
     def file(self) -> VideoFile:
         """The mp4 file."""
-        return self._open_file(self.path)
+        return self._opener(self.path)
 
     def _part(self, first: int, last: int) -> _Part:
         """Find frames `first` to `last` - 1, with all images from which they are decoded."""

@@ -15,13 +15,13 @@ from demorec.core.errors import ConfigError, DemorecError, RecordingError, descr
 from demorec.core.plain import from_plain
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.files import read_json
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import content_digest, noted, recorded_info, usable_numbers, video_digests
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import is_dataset
 from demorec.datasets.lerobot.prepare import reasons_to_transcode, recorded_videos
-from demorec.datasets.lerobot.rows import DataRows
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import content_digest, noted, recorded_info, usable_numbers, video_digests
+from demorec.extensions.datasets.rows import DataRows
 from demorec.mcap import open_simulated
 from demorec.runs.run_file import DATASET, EPISODES, FAILED
 

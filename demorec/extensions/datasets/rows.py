@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
-from demorec.datasets.lerobot.episode_places import EpisodePlace
-from demorec.datasets.lerobot.files import TableReader, column_numbers, table_batches
+from demorec.datasets.lerobot.files import TableReader, column_numbers, column_values, table_batches
 from demorec.datasets.lerobot.language import column_digests
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.extensions.datasets.episode_places import EpisodePlace
 
 if TYPE_CHECKING:
     from demorec.mcap.video import Rgb
@@ -47,24 +47,23 @@ class DataRows:
 
     def __init__(
         self,
-        features: Mapping[str, DatasetFeature],
+        info: DatasetInfo,
         num_rows: Mapping[Path, int],
         names: Sequence[str],
         *,
-        fps: float,
         task_number: Callable[[EpisodePlace], int],
-        own: Sequence[str] = OWN_COUNTERS,
+        own: Sequence[str],
     ) -> None:
-        if missing := [name for name in names if name not in features]:
+        if missing := [name for name in names if name not in info.features]:
             raise ExportError(f"The dataset has no {', '.join(missing)}, according to {INFO_PATH}")
         self.names = list(names)
-        self._features = {name: features[name] for name in names}
-        self._num_rows, self._fps, self._task_number, self._own = num_rows, fps, task_number, own
+        self._fps, self._num_rows, self._task_number, self._own = info.fps, num_rows, task_number, own
+        self._features = {name: info.features[name] for name in names}
         kinds = {feature.dtype for feature in self._features.values()}
         max_rows = 16 if "image" in kinds else 64 if kinds & {"string", "language"} else 4096
         self._automatic = [name for name in names if name in AUTOMATIC_FEATURES]
         stored = [name for name in names if name not in AUTOMATIC_FEATURES]
-        self._tables = TableReader(stored, optional=[*self._automatic, *own], rows=max_rows)
+        self._tables = TableReader(stored, optional=[*self._automatic, *self._own], rows=max_rows)
 
     def batches(self, place: EpisodePlace) -> Iterator[pa.RecordBatch]:
         """Yield the rows of an episode."""
@@ -92,12 +91,19 @@ class DataRows:
         for name in self._automatic:
             number = batch.schema.get_field_index(name)
             if number < 0:
-                values = _implied(name, frames, place, self._fps, self._task_number)
-                batch = batch.append_column(name, pa.array(values))
+                batch = batch.append_column(name, pa.array(self._implied(name, frames, place)))
             elif name != "timestamp" and batch.column(number).type != pa.int64():
                 with _column_errors(name, place):
                     batch = batch.set_column(number, name, batch.column(number).cast(pa.int64()))
         return batch
+
+    def _implied(self, name: str, frames: NDArray[np.int64], place: EpisodePlace) -> NDArray[Any]:
+        if name == "timestamp":
+            return (frames / self._fps).astype(np.float32)
+        if name == "task_index":
+            return np.full(len(frames), self._task_number(place))
+        first = {"frame_index": 0, "index": place.from_index, "episode_index": place.episode_index}[name]
+        return first + frames * (name != "episode_index")
 
     def read(self, place: EpisodePlace) -> pa.Table:
         """Read all rows of an episode. Raises ExportError also if it has none."""
@@ -135,17 +141,6 @@ class DataRows:
         return values
 
 
-def _implied(
-    name: str, frames: NDArray[np.int64], place: EpisodePlace, fps: float, task_number: Callable[[EpisodePlace], int]
-) -> NDArray[Any]:
-    if name == "timestamp":
-        return (frames / fps).astype(np.float32)
-    if name == "task_index":
-        return np.full(len(frames), task_number(place))
-    first = {"frame_index": 0, "index": place.from_index, "episode_index": place.episode_index}[name]
-    return first + frames * (name != "episode_index")
-
-
 def _check_own(batch: pa.RecordBatch, place: EpisodePlace, begin: int, own: Sequence[str]) -> None:
     expected = {"episode_index": place.episode_index, "frame_index": np.arange(begin, begin + len(batch))}
     for name, numbers in expected.items():
@@ -166,13 +161,6 @@ def _column_errors(name: str, place: EpisodePlace) -> Iterator[None]:
         yield
     except (ValueError, TypeError, LookupError, pa.ArrowException) as error:
         raise ExportError(f"The column {name} holds values that are not numbers: {place.data}") from error
-
-
-def column_values(column: pa.Array) -> NDArray[Any]:
-    """Convert a column to (T, D) numbers, or (T, 1) texts."""
-    if str(column.type) in ("string", "large_string"):
-        return np.array(column.to_pylist(), dtype=np.str_).reshape(-1, 1)
-    return column_numbers(column)
 
 
 def _image_digests(column: pa.Array) -> NDArray[np.str_]:

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.plain import listed
-from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 from demorec.datasets.options import ProgressCallback
+from demorec.extensions.datasets.folder import LeRobotFolder
 
 TASK = "task"
 """Name of the instructions, instead of `task_index`."""

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from demorec.cli.shared.flags import arg
 from demorec.core.errors import ConfigError, check_seed
-from demorec.extensions.editing.command import EditOne, pairs
+from demorec.datasets.options import select_episodes
+from demorec.extensions.datasets.command import EditOne, pairs
 
 if TYPE_CHECKING:
-    from demorec.datasets.lerobot.folder import LeRobotFolder
-    from demorec.extensions.editing.plan import Plan
+    from demorec.extensions.datasets.folder import LeRobotFolder
+    from demorec.extensions.datasets.plan import Plan
 
 _SHARE_TOLERANCE = 1e-6
 _CONDITION_HELP = (
@@ -35,8 +36,7 @@ class Chosen(EditOne):
 
     def chosen(self, plan: Plan) -> set[int]:
         """Numbers of the selected episodes."""
-        from demorec.datasets.options import select_episodes
-        from demorec.extensions.editing.condition import matching_episodes
+        from demorec.extensions.datasets.condition import matching_episodes
 
         numbers = select_episodes(range(len(plan.cuts)), " ".join(self.episodes))
         return matching_episodes(plan.sources[0], self.where).intersection(numbers)
@@ -112,8 +112,6 @@ class Reorder(EditOne):
 
     def edited(self, plan: Plan) -> Plan:
         """All episodes in the new order."""
-        from demorec.datasets.options import select_episodes
-
         count = len(plan.cuts)
         order = select_episodes(range(count), " ".join(self.order), "order")
         if not self.order or sorted(order) != list(range(count)):
@@ -164,7 +162,7 @@ class Split(EditOne):
         """Name of each part -> its plan, in the dataset's order; no part is empty."""
         import numpy as np
 
-        from demorec.extensions.editing.plan import Plan
+        from demorec.extensions.datasets.plan import Plan
 
         shares, plan = self._shares(), Plan.whole(sources[0])
         found: dict[str, list[int]] = {name: [] for name in shares}
@@ -181,7 +179,7 @@ class Split(EditOne):
 
     def _groups(self, plan: Plan) -> Collection[Sequence[int]]:
         """Numbers of the episodes with each value of the column."""
-        from demorec.extensions.editing.condition import check_column, columns_of
+        from demorec.extensions.datasets.condition import check_column, columns_of
 
         if not self.by:
             return [range(len(plan.cuts))]

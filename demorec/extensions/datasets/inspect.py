@@ -12,9 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
-from demorec.datasets.lerobot.episode_places import EpisodePlace
-from demorec.datasets.lerobot.files import open_table, read_json, read_json_lines, read_table, table_batches
-from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.files import check_tables, open_table, read_table, table_batches
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     NUMBER_TYPES,
@@ -24,23 +22,18 @@ from demorec.datasets.lerobot.layout import (
     combined_digest,
     episode_digest,
 )
-from demorec.datasets.lerobot.rows import DataRows
 from demorec.datasets.lerobot.stats import NAMES
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
+from demorec.extensions.datasets.episode_places import EpisodePlace, read_json_lines
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.rows import DataRows
 
 OLD_STATS = "meta/episodes_stats.jsonl"
 """Statistics of each episode before v3.0."""
 _SIDECAR = (
-    "source",
-    "success",
-    "failure_phase",
-    "failure_reason",
-    "num_retries",
-    "attempt",
-    "run_episode_index",
-    "root_seed",
-)
+    "source", "success", "failure_phase", "failure_reason", "num_retries", "attempt", "run_episode_index", "root_seed",
+)  # fmt: skip
 """Columns of the sidecar for selecting episodes."""
 _DTYPE_NAMES = {"halffloat": "float16", "float": "float32", "double": "float64", "large_string": "string"}
 """Arrow's type names -> LeRobot's, if different."""
@@ -58,7 +51,7 @@ def dataset_problems(folder: LeRobotFolder) -> list[str]:
     """List missing, empty and truncated files, one sentence each; reads only the ends of files, which is fast. `demorec
     check` reads their whole content.
     """
-    from demorec.datasets.lerobot.mp4_index import check_video  # loads libav
+    from demorec.extensions.datasets.mp4_index import check_video  # loads libav
 
     problems: list[str] = []
     places: Sequence[EpisodePlace] = ()
@@ -127,18 +120,6 @@ def usable_numbers(folder: LeRobotFolder, rows: DataRows, place: EpisodePlace) -
 def without_digest(info: DatasetInfo) -> list[str]:
     """Features without a content digest: all except video, numbers and text, including text in language columns."""
     return [name for name, feature in info.features.items() if feature.dtype == "image"]
-
-
-def check_tables(path: Path) -> None:
-    """Read the ends of all tables and the JSON files. Raises ExportError for an empty or truncated one."""
-    for file in sorted(path.rglob("*")):
-        try:
-            if file.suffix == ".parquet":
-                open_table(file)
-            elif file.suffix == ".json":
-                read_json(file)
-        except (OSError, ValueError) as error:
-            raise ExportError(f"The dataset is damaged ({describe_error(error)}): {file}") from error
 
 
 def dataset_digest(path: Path) -> str:

@@ -12,8 +12,8 @@ from demorec.core.errors import ConfigError
 from demorec.core.extension import rows_of
 from demorec.core.registry import nearest_match
 from demorec.core.replacing import shown
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import episode_columns
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import episode_columns
 
 _MAX_LENGTH = 2000
 _MAX_LISTED = 30

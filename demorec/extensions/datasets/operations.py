@@ -11,11 +11,11 @@ from demorec.cli.shared.flags import Positional, arg
 from demorec.cli.shared.output import ProgressBar, counted, say
 from demorec.core.errors import ConfigError, ExportError, check_option
 from demorec.core.plain import listed
-from demorec.extensions.editing.command import Edit, EditOne, dataset_at, pairs
+from demorec.extensions.datasets.command import Edit, EditOne, dataset_at, leave_pandas_out, pairs
 
 if TYPE_CHECKING:
-    from demorec.datasets.lerobot.folder import LeRobotFolder
-    from demorec.extensions.editing.plan import Plan
+    from demorec.extensions.datasets.folder import LeRobotFolder
+    from demorec.extensions.datasets.plan import Plan
 
 _MAX_LISTED = 30
 
@@ -42,7 +42,7 @@ class Trim(EditOne):
 
     def edited(self, plan: Plan) -> Plan:
         """All episodes, trimmed."""
-        from demorec.extensions.editing.cut import without_idle_ends
+        from demorec.extensions.datasets.cut import without_idle_ends
 
         if self.idle == bool(self.head or self.tail):
             raise ConfigError("Give either --idle, or frames by --head and --tail.")
@@ -86,7 +86,7 @@ class Cut(EditOne):
 
     def edited(self, plan: Plan) -> Plan:
         """All episodes, cut."""
-        from demorec.extensions.editing import cut
+        from demorec.extensions.datasets import cut
 
         if [bool(self.at), self.jumps, self.pauses is not None].count(True) != 1:
             raise ConfigError("Name the cuts: --at EPISODE=FRAMES, --jumps or --pauses SECONDS.")
@@ -159,13 +159,13 @@ class Merge(Edit):
 
     def sources(self) -> Sequence[LeRobotFolder]:
         """The datasets in the given order."""
-        from demorec.datasets.lerobot.folder import LeRobotFolder
+        from demorec.extensions.datasets.folder import LeRobotFolder
 
         return [LeRobotFolder(dataset_at(path)) for path in self.datasets]
 
     def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
         """All episodes, dataset after dataset."""
-        from demorec.extensions.editing.merge import differences, joined, mapped_plans
+        from demorec.extensions.datasets.merge import differences, joined, mapped_plans
 
         plans = mapped_plans(sources, self.mapping)
         if wrong := differences(plans):
@@ -189,7 +189,7 @@ class Repair(EditOne):
 
     def sources(self) -> Sequence[LeRobotFolder]:
         """The dataset, reconstructed from its rows."""
-        from demorec.extensions.editing.repair import RepairedDataset
+        from demorec.extensions.datasets.repair import RepairedDataset
 
         return [RepairedDataset(dataset_at(self.dataset))]
 
@@ -201,7 +201,7 @@ class Repair(EditOne):
 
     def edited(self, plan: Plan) -> Plan:
         """All episodes with readable rows and images, with the instructions that their rows lack, and the splits."""
-        from demorec.extensions.editing.repair import RepairedDataset
+        from demorec.extensions.datasets.repair import RepairedDataset
 
         (source,) = plan.sources
         assert isinstance(source, RepairedDataset)
@@ -225,8 +225,7 @@ class Diff:
 
     def run(self) -> int:
         """Compare and print the differences."""
-        from demorec.datasets.lerobot.files import leave_pandas_out
-        from demorec.extensions.editing.diff import diff
+        from demorec.extensions.datasets.diff import diff
 
         leave_pandas_out()
         a, b = dataset_at(self.a), dataset_at(self.b)

@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
-from demorec.datasets.lerobot.episode_places import are_on_grid
-from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
-from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
-from demorec.datasets.lerobot.videos import EpisodeVideo
+from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.episode import MAX_STAMP_NS, MAX_SUBTASK, Outcome, Table
 from demorec.episode.features import DEPTH_SUFFIX
 from demorec.episode.info import Camera, EpisodeInfo, Origin
 from demorec.episode.protocol import Episode, SceneMotion
 from demorec.episode.roles import Roles
+from demorec.extensions.datasets.episode_places import are_on_grid
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.robots import described, recognised_robot, robot_of_motors
+from demorec.extensions.datasets.videos import EpisodeVideo
 from demorec.mcap.streams import frame_times
 from demorec.mcap.transforms import measured_motion
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
@@ -41,6 +42,7 @@ class DatasetRecording(Episode):
 
     Args:
         number: Position of the episode in the dataset, from 0.
+        finds_robot: Whether to describe also an arm that its joints' names identify, or that other episodes lack.
 
     Attributes:
         known: The sidecar's data about it; empty if there are none.
@@ -48,9 +50,9 @@ class DatasetRecording(Episode):
     Methods and properties raise ExportError for unreadable files.
     """
 
-    def __init__(self, dataset: LeRobotFolder, number: int) -> None:
+    def __init__(self, dataset: LeRobotFolder, number: int, *, finds_robot: bool = False) -> None:
         self.place = place = dataset.places[number]
-        self.path, self.dataset = dataset.root, dataset
+        self.path, self.dataset, self._finds_robot = dataset.root, dataset, finds_robot
         self.num_frames = place.length
         self.known: Mapping[str, Any] = dataset.known.get(place.episode_index, {})
         self._is_depth = {name: dataset.info.features[key].is_depth for name, key in dataset.keys.items()}
@@ -88,7 +90,8 @@ class DatasetRecording(Episode):
             cameras=tuple(cameras),
             origin=Origin(kind="dataset"),
         )
-        return info if robot is None else with_robot(info, robot, self.dataset.roles)
+        robot = self.robot if robot is None and self._finds_robot else robot
+        return info if robot is None else _with_robot(info, robot, self.dataset.roles)
 
     def _instruction(self) -> str:
         indices = dict.fromkeys(self._rows["task_index"][:, 0].tolist())
@@ -273,9 +276,9 @@ class DatasetRecording(Episode):
         return texts, left_out
 
 
-def with_robot(info: EpisodeInfo, robot: DatasetRobot, roles: Roles) -> EpisodeInfo:
+def _with_robot(info: EpisodeInfo, robot: DatasetRobot, roles: Roles) -> EpisodeInfo:
     """Add an arm and the joints that the features move to a description."""
-    features = tuple(robot.described(feature, roles.usual_name(feature.name)) for feature in info.features)
+    features = tuple(described(robot, feature, roles.usual_name(feature.name)) for feature in info.features)
     return replace(info, urdf=robot.urdf, features=features)
 
 

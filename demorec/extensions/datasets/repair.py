@@ -14,7 +14,19 @@ import numpy as np
 
 from demorec.core.errors import ExportError, without_path
 from demorec.core.replacing import shown
-from demorec.datasets.lerobot.episode_places import (
+from demorec.datasets.lerobot.files import column_numbers, open_table
+from demorec.datasets.lerobot.paths import is_dataset_file
+from demorec.extensions.datasets.corrections import (
+    Repaired,
+    kept_splits,
+    repaired_cameras,
+    repaired_features,
+    repaired_rate,
+    stated_info,
+    table_changes,
+    usable_info,
+)
+from demorec.extensions.datasets.episode_places import (
     EpisodePlace,
     EpisodeRun,
     are_on_grid,
@@ -25,21 +37,9 @@ from demorec.datasets.lerobot.episode_places import (
     read_episode_table,
     read_tasks,
 )
-from demorec.datasets.lerobot.files import column_numbers, open_table
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.mp4_index import mp4_index
-from demorec.datasets.lerobot.paths import is_dataset_file
-from demorec.datasets.lerobot.rows import DataRows
-from demorec.extensions.editing.corrections import (
-    Repaired,
-    kept_splits,
-    repaired_cameras,
-    repaired_features,
-    repaired_rate,
-    stated_info,
-    table_changes,
-    usable_info,
-)
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.mp4_index import mp4_index
+from demorec.extensions.datasets.rows import DataRows
 
 _Images = list[tuple[Path, int] | None]
 

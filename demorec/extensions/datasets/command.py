@@ -1,9 +1,11 @@
-"""`demorec dataset`: the parts that its commands share, which are the new dataset and its printed summary."""
+"""Parts that commands on datasets share: the new dataset and its printed summary, and the flags of an arm's servos."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,10 +20,13 @@ from demorec.core.registry import Registry
 from demorec.core.replacing import OptionalTarget, check_replaceable
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.datasets.lerobot.paths import is_dataset
+from demorec.robots.motors import Motors, MotorUnits
+from demorec.runs.find import expect
+from demorec.runs.run_file import DATASET
 
 if TYPE_CHECKING:
-    from demorec.datasets.lerobot.folder import LeRobotFolder
-    from demorec.extensions.editing.plan import EpisodeSlice, Plan
+    from demorec.extensions.datasets.folder import LeRobotFolder
+    from demorec.extensions.datasets.plan import EpisodeSlice, Plan
 
 _RESULT = replace(DATASET_KIND, advice="choose --overwrite or another --out")
 MAX_SHOWN = 20
@@ -71,8 +76,6 @@ class Edit:
 
     def run(self) -> int:
         """Plan, write, and print a summary."""
-        from demorec.datasets.lerobot.files import leave_pandas_out
-
         leave_pandas_out()
         if self.out is None and not self.dry_run:
             raise ConfigError("Name the folder of the new dataset (--out NEW), or preview it (--dry-run).")
@@ -95,7 +98,7 @@ class Edit:
 
     def _write(self, sources: Sequence[LeRobotFolder], outs: Sequence[Path]) -> None:
         """Write the new datasets, which appear together, and print a summary."""
-        from demorec.extensions.editing.write import write_plan
+        from demorec.extensions.datasets.write import write_plan
 
         results: list[tuple[int, int]] = []
         roots = [source.root for source in sources]
@@ -113,7 +116,7 @@ class Edit:
                 say(f"Images of {counted(decoded, 'episode')} were decoded for their statistics.")
 
     def _print_result(self, begin: str, name: str, plan: Plan, left: str) -> None:
-        from demorec.extensions.editing.beside import MAX_NAMES, copied_unchecked_files, left_out
+        from demorec.extensions.datasets.beside import MAX_NAMES, copied_unchecked_files, left_out
 
         lengths = [place.length for source in plan.sources for place in source.places]
         frames = sum(cut.last - cut.first for cut in plan.cuts)
@@ -137,13 +140,13 @@ class EditOne(Edit):
 
     def sources(self) -> Sequence[LeRobotFolder]:
         """The dataset."""
-        from demorec.datasets.lerobot.folder import LeRobotFolder
+        from demorec.extensions.datasets.folder import LeRobotFolder
 
         return [LeRobotFolder(dataset_at(self.dataset))]
 
     def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
         """The edited plan of the whole dataset."""
-        from demorec.extensions.editing.plan import Plan
+        from demorec.extensions.datasets.plan import Plan
 
         return {"": self.edited(Plan.whole(sources[0]))}
 
@@ -152,9 +155,35 @@ class EditOne(Edit):
         raise NotImplementedError
 
 
+@dataclass(frozen=True, kw_only=True)
+class MotorFlags:
+    """The servos of a real arm whose values LeRobot recorded as state and action."""
+
+    motor_units: MotorUnits | None = None
+    """Joint units of a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): degrees,
+    LeRobot's default, or -100..100 of each joint's range. The dataset does not record the units.
+    """
+    calibration: Path | None = None
+    """With --motor-units: LeRobot's calibration file of the arm (auto: an arm that matches its URDF)."""
+
+    @property
+    def named(self) -> Motors | None:
+        """The servos; None without --motor-units. Raises ConfigError if the calibration does not match them."""
+        from demorec.robots.so101 import SO101_FOLLOWER
+
+        if self.motor_units is not None:
+            return SO101_FOLLOWER.motors(self.motor_units, self.calibration)
+        if self.calibration is not None:
+            raise ConfigError("--calibration belongs to --motor-units.")
+        return None
+
+
+MotorsByFlags = Annotated[MotorFlags, arg(name="")]
+
+
 def _changes(plan: Plan) -> list[str]:
     """Lines about the changes of episodes."""
-    from demorec.datasets.lerobot.inspect import mistyped_features
+    from demorec.extensions.datasets.inspect import mistyped_features
 
     lines = []
     for source in plan.sources:
@@ -179,11 +208,26 @@ def _changes(plan: Plan) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
+def leave_pandas_out() -> None:
+    """Make PyArrow work without pandas in this process. PyArrow would import pandas, which takes longer than most
+    edits, to check whether given lists are pandas objects.
+    """
+    import pyarrow as pa
+
+    finder = _NoPandas()
+    sys.meta_path.insert(0, finder)
+    pa.array([0])  # checks for pandas once and caches the result
+    sys.meta_path.remove(finder)
+
+
+class _NoPandas(MetaPathFinder):
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> None:
+        if fullname == "pandas":
+            raise ImportError
+
+
 def dataset_at(path: Path) -> Path:
     """The named dataset, or a run's dataset; ConfigError for anything else."""
-    from demorec.runs.find import expect
-    from demorec.runs.run_file import DATASET
-
     if expect(path, "dataset", "run").kind == "dataset":
         return path
     if not is_dataset(path / DATASET):

@@ -9,22 +9,44 @@ import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from demorec.core.errors import RecordingError, describe_error, resource_error
+from demorec.core.errors import ConfigError, RecordingError, describe_error, resource_error
 from demorec.core.geometry import Array, Pose
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.recording import DatasetRecording, with_robot
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.protocol import SceneMotion
+from demorec.episode.roles import NamedRoles
 from demorec.episode.validity import read_episode_info
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.recording import DatasetRecording
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import check_primitives
 from demorec.view.episode import Playback, feature_curves, simulated_curves
+from demorec.view.sources import PlaybackSource
+
+
+def dataset_episodes(path: Path, named: NamedRoles) -> list[PlaybackSource]:
+    """List the episodes of a dataset for playback. Raises ConfigError if it has none, or lacks a feature that the user
+    named, and ExportError if it cannot be read.
+    """
+    dataset = LeRobotFolder(path, named=named)
+    if not dataset.places:
+        raise ConfigError(f"The dataset has no episodes to show: {path}")
+    missing = dataset.leave_out_missing_cameras()
+    notes = (*dataset.notes, *(f"No episode has a video of {key}, which is not shown: {path}" for key in missing))
+    return [
+        PlaybackSource(
+            name=f"{path}: episode {place.episode_index}",
+            open=partial(open_dataset_episode, dataset, number),
+            notes=notes,
+        )
+        for number, place in enumerate(dataset.places)
+    ]
 
 
 @contextmanager
@@ -45,7 +67,7 @@ def open_dataset_episode(dataset: LeRobotFolder, number: int) -> Iterator[Playba
 
 def _playback(dataset: LeRobotFolder, number: int) -> Playback:
     root = dataset.root.resolve()
-    data: DatasetRecording = _ShownEpisode(dataset, number)
+    data = DatasetRecording(dataset, number, finds_robot=True)
     has_scene = data.known.get("root_seed") is not None and {STATE, ACTION} <= dataset.info.features.keys()
     if has_scene:
         data = _SimulatedEpisode(dataset, number)
@@ -64,16 +86,6 @@ def _playback(dataset: LeRobotFolder, number: int) -> Playback:
         curves=simulated_curves(data) if has_scene else feature_curves(data, dataset.roles),
         statements=statements,
     )
-
-
-class _ShownEpisode(DatasetRecording):
-    """An episode that, without a robot description, gets the arm identified by its joint names."""
-
-    @cached_property
-    def info(self) -> EpisodeInfo:
-        """The description of `DatasetRecording`, with that arm."""
-        info, robot = super().info, self.robot
-        return info if info.urdf or robot is None else with_robot(info, robot, self.dataset.roles)
 
 
 class _SimulatedEpisode(DatasetRecording):

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
 from demorec.core.registry import check_choice
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import mistyped_features
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     CODEBASE_VERSION,
@@ -23,6 +21,8 @@ from demorec.datasets.lerobot.layout import (
     is_task_reference,
 )
 from demorec.episode.features import ACTION, STATE
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import mistyped_features
 
 _KNOWN_REFERENCE = "annotation."
 """Prefix of GR00T's columns with task numbers."""

@@ -25,9 +25,9 @@ import numpy as np
 from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import read_text_limited
 from demorec.core.registry import check_choice
-from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import DatasetFeature
-from demorec.extensions.editing.plan import FeatureMapping, Plan
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.plan import FeatureMapping, Plan
 
 _UNITS = ("rad", "degree", "normalised")
 _MAX_BYTES = 1 << 20
@@ -107,7 +107,7 @@ def _converted(
     own: DatasetFeature, mapping: FeatureMapping, item: Mapping[str, Any], model: DatasetFeature
 ) -> tuple[DatasetFeature, FeatureMapping]:
     """A converted feature of the merged dataset, which has one like `model`, and its mapping."""
-    if not _is_vector(own, model):
+    if not all(feature.is_numeric and len(feature.shape) == 1 for feature in (own, model)):
         raise ValueError("only vectors of numbers are converted")
     elements = None
     if "elements" in item:
@@ -149,7 +149,3 @@ def _differences(a: Plan, b: Plan) -> Iterator[str]:
             continue
         for what, value, first in feature.differences(there):
             yield f"{name} of {root} has {what} {value}, not {first}"
-
-
-def _is_vector(*features: DatasetFeature) -> bool:
-    return all(feature.is_numeric and len(feature.shape) == 1 for feature in features)

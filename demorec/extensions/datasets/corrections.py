@@ -15,20 +15,14 @@ import pyarrow as pa
 
 from demorec.core.errors import ExportError, without_path
 from demorec.core.replacing import shown
-from demorec.datasets.lerobot.episode_places import EpisodePlace, read_tasks
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, read_table, table_batches
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import OLD_STATS, range_errors, stored_dtype
-from demorec.datasets.lerobot.layout import (
-    AUTOMATIC_FEATURES,
-    STATS_PATH,
-    TASKS_PATH,
-    DatasetFeature,
-    DatasetInfo,
-)
-from demorec.datasets.lerobot.mp4_index import mp4_index
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.datasets.lerobot.statistic_errors import statistic_errors
+from demorec.extensions.datasets.episode_places import EpisodePlace, read_tasks
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import OLD_STATS, range_errors, stored_dtype
+from demorec.extensions.datasets.mp4_index import mp4_index
+from demorec.extensions.datasets.statistic_errors import statistic_errors
 
 _SIZES = {"chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
 _COUNTS: dict[str, int] = {"total_episodes": 0, "total_frames": 0, "total_tasks": 0, **_SIZES}

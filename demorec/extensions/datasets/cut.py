@@ -13,7 +13,7 @@ from demorec.core.geometry import Array
 from demorec.core.registry import check_choice
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
-from demorec.extensions.editing.plan import EpisodeSlice, Plan
+from demorec.extensions.datasets.plan import EpisodeSlice, Plan
 
 _NEAR = 5
 """Number of steps before and after a step for comparison; a slow sensor repeats a number for fewer frames."""

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import OLD_STATS, episode_statistics
 from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import OLD_STATS, episode_statistics
 
 _MEASURED = tuple(name for name in NAMES if name != "count")
 _RENUMBERED = ("index", "episode_index")

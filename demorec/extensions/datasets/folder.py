@@ -22,7 +22,12 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
-from demorec.datasets.lerobot.episode_places import (
+from demorec.datasets.lerobot.files import open_table, read_json, read_table, tables_in
+from demorec.datasets.lerobot.language import COLUMNS
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, DatasetInfo
+from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
+from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
+from demorec.extensions.datasets.episode_places import (
     REPAIR,
     EpisodePlace,
     has_episode_table,
@@ -32,19 +37,13 @@ from demorec.datasets.lerobot.episode_places import (
     relocated,
     rows_by_file,
 )
-from demorec.datasets.lerobot.files import open_table, read_json, read_table, tables_in
-from demorec.datasets.lerobot.language import COLUMNS
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, DatasetInfo
-from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.rows import OWN_COUNTERS, DataRows, EpisodeTable
-from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
+from demorec.extensions.datasets.rows import OWN_COUNTERS, DataRows, EpisodeTable, StoredImages
 
 # Code for videos, images, robots and the sidecar takes longer to load than most datasets' numbers to read.
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.robots import DatasetRobot
-    from demorec.datasets.lerobot.rows import StoredImages
-    from demorec.datasets.lerobot.videos import EpisodeVideo, VideoFile
     from demorec.episode.info import Camera, Feature, Kept
+    from demorec.extensions.datasets.videos import EpisodeVideo, VideoFile
     from demorec.robots.motors import Motors
 
 _MAX_LISTED = 50
@@ -81,12 +80,7 @@ class LeRobotFolder:
     """
 
     def __init__(
-        self,
-        root: Path,
-        motors: Motors | None = None,
-        named: NamedRoles = NO_NAMES,
-        *,
-        info: DatasetInfo | None = None,
+        self, root: Path, motors: Motors | None = None, named: NamedRoles = NO_NAMES, *, info: DatasetInfo | None = None
     ) -> None:
         self.root, self.motors, self._named = root, motors, named
         self.info = DatasetInfo.load(root) if info is None else info
@@ -102,14 +96,14 @@ class LeRobotFolder:
         self.robot = cache(self._robot)
 
     def _video_file(self, path: Path) -> VideoFile:
-        from demorec.datasets.lerobot.videos import VideoFile
+        from demorec.extensions.datasets.videos import VideoFile
 
         return VideoFile(path, self.info.fps)
 
     @cached_property
     def roles(self) -> Roles:
         """The role of each feature. Raises ConfigError if the dataset lacks one that the user names."""
-        from demorec.datasets.lerobot.dataset_features import dataset_roles
+        from demorec.extensions.datasets.dataset_features import dataset_roles
 
         return dataset_roles(self.root, self.info, self._named)
 
@@ -140,7 +134,7 @@ class LeRobotFolder:
 
     @cached_property
     def _short_videos(self) -> tuple[str, ...]:
-        from demorec.datasets.lerobot.mp4_index import mp4_index
+        from demorec.extensions.datasets.mp4_index import mp4_index
 
         notes: list[str] = []
         for key in self.info.video_keys:
@@ -231,14 +225,7 @@ class LeRobotFolder:
 
     def rows(self, names: Sequence[str]) -> DataRows:
         """Read some columns of the data files."""
-        return DataRows(
-            self.info.features,
-            self.num_rows,
-            names,
-            fps=self.info.fps,
-            task_number=self._only_task_number,
-            own=self.own_counters,
-        )
+        return DataRows(self.info, self.num_rows, names, task_number=self._only_task_number, own=self.own_counters)
 
     def _only_task_number(self, place: EpisodePlace) -> int:
         if len(place.tasks) != 1 or place.tasks[0] not in self.tasks:
@@ -265,7 +252,7 @@ class LeRobotFolder:
 
     def video(self, key: str, place: EpisodePlace) -> EpisodeVideo:
         """Open the images of a video feature in an episode. Raises ExportError if it has no file."""
-        from demorec.datasets.lerobot.videos import EpisodeVideo
+        from demorec.extensions.datasets.videos import EpisodeVideo
 
         if not (path := place.videos[key][0]).exists():
             without = [other for other in self.listed if not other.videos[key][0].exists()]
@@ -277,13 +264,11 @@ class LeRobotFolder:
                 f"{drop if len(without) < len(self.listed) else ''}leave the camera out (demorec dataset drop-features "
                 f"DATASET {key} --out NEW): {path}"
             )
-        return EpisodeVideo(self.open_video, key, place, self.info.features[key], int(self.info.fps))
+        return EpisodeVideo(self.open_video, key, place, self.info)
 
     @cached_property
     def stored_images(self) -> Mapping[str, StoredImages]:
         """Feature -> its images, for features stored in the data files."""
-        from demorec.datasets.lerobot.rows import StoredImages
-
         keys = [name for name, feature in self.info.features.items() if feature.dtype == "image"]
         return {key: StoredImages(self.rows([key])) for key in keys}
 
@@ -330,14 +315,14 @@ class LeRobotFolder:
         return len({self.known.get(place.episode_index, {}).get("robot_digest") for place in self.places}) <= 1
 
     def _robot(self, digest: str) -> DatasetRobot:
-        from demorec.datasets.lerobot.robots import read_robot
+        from demorec.extensions.datasets.robots import read_robot
 
         return read_robot(self.root, digest)
 
     @cached_property
     def features(self) -> tuple[Feature, ...]:
         """Numeric features of its recordings."""
-        from demorec.datasets.lerobot.dataset_features import recorded_feature, why_not_recorded
+        from demorec.extensions.datasets.dataset_features import recorded_feature, why_not_recorded
 
         roles = self.roles.beyond_names()
         return tuple(
@@ -346,10 +331,13 @@ class LeRobotFolder:
             if not (feature.is_camera or name in AUTOMATIC_FEATURES or why_not_recorded(name, feature))
         )
 
+    def is_absent(self, key: str) -> bool:
+        """Whether all of a camera's video files are missing, as after a download of the tables alone."""
+        return not any(place.videos[key][0].exists() for place in self.listed)
+
     def leave_out_missing_cameras(self) -> tuple[str, ...]:
         """Exclude the cameras without a video in any episode from recordings; return their features."""
-        videos = [key for key in self.keys.values() if self.info.features[key].is_video]
-        found = tuple(key for key in videos if not any(place.videos[key][0].exists() for place in self.listed))
+        found = tuple(key for key in self.keys.values() if self.info.features[key].is_video and self.is_absent(key))
         self.keys = {name: key for name, key in self.keys.items() if key not in found}
         return found
 
@@ -360,7 +348,7 @@ class LeRobotFolder:
     @cached_property
     def keys(self) -> Mapping[str, str]:
         """Camera name in recordings -> feature. Raises ConfigError if two cameras would get the same name."""
-        from demorec.datasets.lerobot.dataset_features import camera_name, why_not_recorded
+        from demorec.extensions.datasets.dataset_features import camera_name, why_not_recorded
 
         found: dict[str, str] = {}
         for key, feature in self.info.features.items():

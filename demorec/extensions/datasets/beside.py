@@ -12,11 +12,11 @@ from typing import Any
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.plain import listed, parse_json, to_json
-from demorec.datasets.lerobot.dataset_features import MODALITY_PATH
 from demorec.datasets.lerobot.files import open_table, read_json
 from demorec.datasets.lerobot.paths import BOXES_DIR, CARD_PATH, INFO_PATH, PROGRESS_PATH, is_dataset_file
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH, EpisodeRecord
-from demorec.extensions.editing.plan import EpisodeSlice, Plan
+from demorec.extensions.datasets.dataset_features import MODALITY_PATH
+from demorec.extensions.datasets.plan import EpisodeSlice, Plan
 
 _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "episode_info")
 """Columns that describe a simulated episode as recorded, and do not apply to a cut one."""

@@ -19,12 +19,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError
+from demorec.core.errors import ExportError, describe_error
+from demorec.core.files import read_text_limited
+from demorec.core.plain import parse_json
 from demorec.datasets.lerobot.files import (
+    MAX_JSON_BYTES,
     TableReader,
     column_numbers,
     open_table,
-    read_json_lines,
     read_table,
     tables_in,
 )
@@ -36,7 +38,7 @@ from demorec.datasets.lerobot.layout import (
     DatasetInfo,
     FilePosition,
 )
-from demorec.datasets.lerobot.mp4_index import mp4_index
+from demorec.extensions.datasets.mp4_index import mp4_index
 
 TIME_TOLERANCE_S = 1e-4
 """Maximum distance of a row's timestamp from the grid, as in LeRobot."""
@@ -173,6 +175,18 @@ def read_tasks(root: Path) -> list[str]:
         raise ExportError(f"The tasks' table has no task or no task_index: {path}")
     numbers, texts = table.column("task_index").to_pylist(), table.column(column).to_pylist()
     return _by_number(list(zip(numbers, texts, strict=True)), path)
+
+
+def read_json_lines(path: Path) -> list[dict[str, Any]]:
+    """Read the objects of a JSON Lines file; ExportError if it cannot be read, or a line is not an object."""
+    try:
+        lines = read_text_limited(path, MAX_JSON_BYTES).splitlines()
+        found = [parse_json(line, allow_nan=True) for line in lines if line.strip()]
+        if not all(isinstance(line, dict) for line in found):
+            raise ValueError("a line is not an object")
+    except (OSError, ValueError) as error:
+        raise ExportError(f"The table cannot be read ({describe_error(error)}): {path}") from error
+    return found
 
 
 def _by_number(rows: Sequence[tuple[object, object]], path: Path) -> list[str]:

@@ -15,20 +15,20 @@ from PIL import Image
 
 from demorec.core.errors import ExportError
 from demorec.core.files import open_regular
-from demorec.datasets.lerobot.episode_places import EpisodePlace, are_on_grid
 from demorec.datasets.lerobot.files import column_numbers
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import episode_statistics
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, language_arrays, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.mp4 import EncodedVideo
-from demorec.datasets.lerobot.rows import EpisodeTable
 from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, colour_levels
-from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.datasets.lerobot.writer import DatasetStart, DatasetWriter, EpisodeData
 from demorec.datasets.options import ProgressCallback
-from demorec.extensions.editing.beside import copied_files, kept_configs, kept_export, sidecar_record
-from demorec.extensions.editing.plan import EpisodeSlice, FeatureMapping, Plan, reference_columns
+from demorec.extensions.datasets.beside import copied_files, kept_configs, kept_export, sidecar_record
+from demorec.extensions.datasets.episode_places import EpisodePlace, are_on_grid
+from demorec.extensions.datasets.folder import LeRobotFolder
+from demorec.extensions.datasets.inspect import episode_statistics
+from demorec.extensions.datasets.plan import EpisodeSlice, FeatureMapping, Plan, reference_columns
+from demorec.extensions.datasets.rows import EpisodeTable
+from demorec.extensions.datasets.videos import EpisodeVideo
 
 if TYPE_CHECKING:
     from demorec.mcap.video import Rgb
