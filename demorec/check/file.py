@@ -84,7 +84,7 @@ def checksums(episode: CheckedEpisode) -> Iterator[Fault]:
         for blocks in container.blocks_by_chunk(container.channels):
             for topic, block in blocks.items():
                 found[topic] += len(block)
-                if topic in stamped and recording.info.simulation is not None:
+                if topic in stamped and episode.form == "simulated":
                     shifted[topic] += _count_other_stamps(block)
     wrong = [
         f"{topic}: {found[topic]}, the index has {count}"

@@ -428,8 +428,7 @@ class Recording(Closing):
         """
         plain = to_plain(self.info)
         del plain["versions"]
-        if self.info.simulation is not None:
-            del plain["simulation"]["cpu"]
+        (plain["simulation"] or {}).pop("cpu", None)
         result = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
         result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
         for name, data in _content(self._numbers):
