@@ -43,6 +43,8 @@ _WORDS: dict[PathKind, tuple[str, str]] = {
     "recordings": ("a folder of recordings", "; name one of them"),
 }
 """Noun for each kind, and advice if the kind was not expected."""
+_OF_EXTENSIONS = ("dataset", "hdf5", "rosbag")
+"""Kinds above that only extensions read."""
 ROSBAG2 = "metadata.yaml"
 """File that marks a folder as a bag of rosbag2."""
 BAG_SUFFIXES = (".db3", ".bag", ".mcap.zstd", ".db3.zstd")
@@ -151,7 +153,7 @@ def _words(kind: PathKind) -> tuple[str, str]:
         return exporter_rows()[kind].name, "; name the run that it was made from"
     if row is None or (kind in _WORDS and not row.advice):
         name, advice = _WORDS[kind]
-        is_read = row is not None or kind in kind_rows() or kind not in ("dataset", "hdf5", "rosbag")
+        is_read = row is not None or kind in kind_rows() or kind not in _OF_EXTENSIONS
         return name, advice if is_read else f", which no installed extension reads{advice}"
     return row.name, f"; {row.advice}" if row.advice else ""
 

@@ -8,8 +8,7 @@ to 0.01 m, closer than any camera measures.
 from __future__ import annotations
 
 import math
-import reprlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any, cast
@@ -54,18 +53,6 @@ class DepthScale:
     shift: float = _SHIFT
     use_log: bool = True
 
-    @classmethod
-    def of(cls, info: Mapping[str, Any]) -> DepthScale:
-        """Read the scale from a feature's `info`, by any writer; ValueError if it is invalid."""
-        numbers = [info.get(f"video.{name}") for name in ("depth_min", "depth_max", "shift")]
-        use_log = info.get("video.use_log")
-        if not isinstance(use_log, bool) or not all(_is_number(number) for number in numbers):
-            raise ValueError(f"its scale of depth is {reprlib.repr([*numbers, use_log])}")
-        nearest, farthest, shift = (float(number) for number in numbers if number is not None)
-        if not nearest < farthest or (use_log and not nearest + shift > 0):
-            raise ValueError(f"its scale of depth is {nearest} to {farthest} m, shifted by {shift}")
-        return cls(nearest=nearest, farthest=farthest, shift=shift, use_log=use_log)
-
     def values(self) -> Array:
         """(4096,) distance in metres of each code."""
         codes = np.arange(LARGEST_CODE + 1)
@@ -77,10 +64,6 @@ class DepthScale:
     def shown(self) -> NDArray[np.float32]:
         """(4096,) the same for display: 0, nothing measured, for the lowest code."""
         return np.concatenate([[0], self.values()[1:]]).astype(np.float32)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e6
 
 
 def depth_video(images: Iterable[NDArray[np.float32]], *, fps: int) -> tuple[EncodedVideo, PixelHistogram]:

@@ -43,7 +43,6 @@ EPISODES_PATH = f"meta/episodes/{_CHUNK}.parquet"
 VIDEO_PATH = "videos/{video_key}/" + f"{_CHUNK}.mp4"
 TASKS_PATH = "meta/tasks.parquet"
 STATS_PATH = "meta/stats.json"
-OLD_EPISODES_PATH, OLD_TASKS_PATH = "meta/episodes.jsonl", "meta/tasks.jsonl"
 
 SIDECAR_EPISODES_PATH = f"{SIDECAR_DIR}/episodes/{_CHUNK}.parquet"
 
@@ -188,15 +187,6 @@ AUTOMATIC_FEATURES: dict[str, DatasetFeature] = {
     **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), DatasetFeature(dtype="int64", shape=(1,))),
 }
 """Automatic features: last in every dataset, filled in by the writer."""
-_TASK_WORD = re.compile(r"(^|[._])(annotations?|tasks?|subtasks?)([._]|$)")
-
-
-def is_task_reference(name: str, feature: DatasetFeature) -> bool:
-    """Whether a feature may refer to tasks by number: an integer column with a name like GR00T's `annotation.*`."""
-    is_number = feature.dtype.startswith(("int", "uint")) and feature.shape == (1,)
-    return is_number and name not in AUTOMATIC_FEATURES and _TASK_WORD.search(name) is not None
-
-
 LANGUAGE_FEATURE = DatasetFeature(dtype="language", shape=(1,))
 """Feature of each of LeRobot's language columns."""
 

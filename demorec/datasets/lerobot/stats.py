@@ -50,18 +50,6 @@ class Statistics:
         """All statistics in LeRobot's form."""
         return {name: self.nested(name) for name in NAMES}
 
-    @classmethod
-    def from_json(cls, entry: Mapping[str, Any]) -> Statistics | None:
-        """Inverse of `to_json`; None if one of the ten is missing, ValueError or TypeError if they are not numbers."""
-        if any(name not in entry for name in NAMES):
-            return None
-        try:
-            values = {name: np.asarray(entry[name], dtype=np.float64).reshape(-1) for name in NAMES if name != "count"}
-            count = int(np.asarray(entry["count"]).reshape(-1)[0])
-        except (IndexError, OverflowError) as error:
-            raise ValueError("statistics that are not numbers") from error
-        return cls(values=values, count=count, is_camera=np.asarray(entry["mean"]).ndim == 3)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PixelHistogram:

@@ -16,7 +16,7 @@ from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.datasets.lerobot.stats import NAMES, Statistics
 from demorec.datasets.lerobot.writer import DatasetStart
 from demorec.extensions.datasets.folder import LeRobotFolder
-from demorec.extensions.datasets.inspect import episode_digests
+from demorec.extensions.datasets.inspect import episode_digests, statistics_from_json
 
 
 def start_after(root: Path) -> DatasetStart:
@@ -68,7 +68,7 @@ def start_after(root: Path) -> DatasetStart:
 
 
 def _statistics(found: Mapping[str, Any], key: str, info: DatasetInfo) -> Statistics | None:
-    part = Statistics.from_json(found.get(key, {}))
+    part = statistics_from_json(found.get(key, {}))
     if part is None:
         return None
     if any(value.shape != info.features[key].shape[-1:] for value in part.values.values()) or part.count < 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -26,6 +27,8 @@ _RECORDED: Mapping[str, Literal["float32", "float64"]] = {
 }
 """Type of a column -> recording type that holds all its values, except the largest integers."""
 NOT_HELD = "imported recordings hold none"
+
+_TASK_WORD = re.compile(r"(^|[._])(annotations?|tasks?|subtasks?)([._]|$)")
 
 
 class _Group(NamedTuple):
@@ -89,6 +92,12 @@ def _elements(groups: list[_Group], info: DatasetInfo) -> dict[str, tuple[str, .
     return {feature: tuple(names) for feature, names in found.items()}
 
 
+def is_task_reference(name: str, feature: DatasetFeature) -> bool:
+    """Whether a feature may refer to tasks by number: an integer column with a name like GR00T's `annotation.*`."""
+    is_number = feature.dtype.startswith(("int", "uint")) and feature.shape == (1,)
+    return is_number and name not in AUTOMATIC_FEATURES and _TASK_WORD.search(name) is not None
+
+
 def camera_name(key: str) -> str:
     """Name the camera of a feature: "top" for "observation.images.top", "image" for "observation.image"."""
     return key.removeprefix(IMAGE_PREFIX).removeprefix("observation.").replace(".", "_")
@@ -111,12 +120,12 @@ def why_not_recorded(name: str, feature: DatasetFeature) -> str:
 
 
 def _why_no_distances(feature: DatasetFeature) -> str:
-    from demorec.datasets.lerobot.depth import DepthScale  # loads libav
+    from demorec.extensions.datasets.videos import depth_scale_of  # loads libav
 
     if not feature.is_video:
         return "its depth is in images, and depth is read from videos"
     try:
-        DepthScale.of(feature.info or {})
+        depth_scale_of(feature.info or {})
     except ValueError as error:
         return str(error)
     return ""

@@ -30,16 +30,11 @@ from demorec.datasets.lerobot.files import (
     read_table,
     tables_in,
 )
-from demorec.datasets.lerobot.layout import (
-    OLD_EPISODES_PATH,
-    OLD_TASKS_PATH,
-    TASKS_PATH,
-    VIDEO_PATH,
-    DatasetInfo,
-    FilePosition,
-)
+from demorec.datasets.lerobot.layout import TASKS_PATH, VIDEO_PATH, DatasetInfo, FilePosition
 from demorec.extensions.datasets.mp4_index import mp4_index
 
+OLD_EPISODES_PATH = "meta/episodes.jsonl"
+OLD_TASKS_PATH = "meta/tasks.jsonl"
 TIME_TOLERANCE_S = 1e-4
 """Maximum distance of a row's timestamp from the grid, as in LeRobot."""
 _MAX_VALUE = 1 << 40

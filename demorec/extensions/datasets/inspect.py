@@ -22,7 +22,7 @@ from demorec.datasets.lerobot.layout import (
     combined_digest,
     episode_digest,
 )
-from demorec.datasets.lerobot.stats import NAMES
+from demorec.datasets.lerobot.stats import NAMES, Statistics
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
 from demorec.extensions.datasets.episode_places import EpisodePlace, read_json_lines
@@ -189,6 +189,20 @@ def episode_statistics(folder: LeRobotFolder, features: Sequence[str]) -> Iterat
                 for name, keys in quantities.items():
                     if keys:
                         yield row["episode_index"], name, {key: row[f"stats/{name}/{key}"] for key in keys}
+
+
+def statistics_from_json(entry: Mapping[str, Any]) -> Statistics | None:
+    """Inverse of `Statistics.to_json`; None if one of the ten is missing. Raises ValueError or TypeError if they are
+    not numbers.
+    """
+    if any(name not in entry for name in NAMES):
+        return None
+    try:
+        values = {name: np.asarray(entry[name], dtype=np.float64).reshape(-1) for name in NAMES if name != "count"}
+        count = int(np.asarray(entry["count"]).reshape(-1)[0])
+    except (IndexError, OverflowError) as error:
+        raise ValueError("statistics that are not numbers") from error
+    return Statistics(values=values, count=count, is_camera=np.asarray(entry["mean"]).ndim == 3)
 
 
 def mistyped_features(source: LeRobotFolder) -> dict[str, FeatureType]:

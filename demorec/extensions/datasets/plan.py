@@ -18,9 +18,9 @@ from demorec.datasets.lerobot.layout import (
     VIDEO_PATH,
     DatasetFeature,
     DatasetInfo,
-    is_task_reference,
 )
 from demorec.episode.features import ACTION, STATE
+from demorec.extensions.datasets.dataset_features import is_task_reference
 from demorec.extensions.datasets.folder import LeRobotFolder
 from demorec.extensions.datasets.inspect import mistyped_features
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import reprlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import cached_property
 from pathlib import Path
@@ -266,7 +267,7 @@ class EpisodeVideo:
     def depth_scale(self) -> DepthScale:
         """Scale from its depth codes to distances. Raises ExportError if it is unknown."""
         try:
-            return DepthScale.of(self._feature.info or {})
+            return depth_scale_of(self._feature.info or {})
         except ValueError as error:
             raise ExportError(
                 f"The depth of {self._key} cannot be read ({error} in {INFO_PATH}): {self.path}"
@@ -332,6 +333,22 @@ class EpisodeVideo:
             if number == self.length:
                 return
         raise ValueError(f"episode {self._episode} has {self.length} frames, but no image for frame {number}")
+
+
+def depth_scale_of(info: Mapping[str, Any]) -> DepthScale:
+    """Read the scale of depth codes from a feature's `info`, by any writer; ValueError if it is invalid."""
+    numbers = [info.get(f"video.{name}") for name in ("depth_min", "depth_max", "shift")]
+    use_log = info.get("video.use_log")
+    if not isinstance(use_log, bool) or not all(_is_number(number) for number in numbers):
+        raise ValueError(f"its scale of depth is {reprlib.repr([*numbers, use_log])}")
+    nearest, farthest, shift = (float(number) for number in numbers if number is not None)
+    if not nearest < farthest or (use_log and not nearest + shift > 0):
+        raise ValueError(f"its scale of depth is {nearest} to {farthest} m, shifted by {shift}")
+    return DepthScale(nearest=nearest, farthest=farthest, shift=shift, use_log=use_log)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e6
 
 
 def _without_gaps(frames: NDArray[np.int64], begin: int, end: int) -> NDArray[np.intp]:

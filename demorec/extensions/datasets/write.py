@@ -25,7 +25,7 @@ from demorec.datasets.options import ProgressCallback
 from demorec.extensions.datasets.beside import copied_files, kept_configs, kept_export, sidecar_record
 from demorec.extensions.datasets.episode_places import EpisodePlace, are_on_grid
 from demorec.extensions.datasets.folder import LeRobotFolder
-from demorec.extensions.datasets.inspect import episode_statistics
+from demorec.extensions.datasets.inspect import episode_statistics, statistics_from_json
 from demorec.extensions.datasets.plan import EpisodeSlice, FeatureMapping, Plan, reference_columns
 from demorec.extensions.datasets.rows import EpisodeTable
 from demorec.extensions.datasets.videos import EpisodeVideo
@@ -264,7 +264,7 @@ def _kept_statistics(source: LeRobotFolder) -> dict[tuple[int, str], tuple[int, 
     found: dict[tuple[int, str], tuple[int, NDArray[np.float64]]] = {}
     for number, key, entry in episode_statistics(source, keys):
         try:
-            part = Statistics.from_json(entry)
+            part = statistics_from_json(entry)
             values = None if part is None else np.stack([part.values[name] for name in _NUMBERS])
         except (ValueError, TypeError):
             continue

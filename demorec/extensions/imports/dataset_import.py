@@ -16,12 +16,11 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError, RecordingError, resource_error
 from demorec.core.files import sha256_of
 from demorec.datasets.lerobot.language import PERSISTENT
-from demorec.datasets.lerobot.layout import is_task_reference
 from demorec.datasets.lerobot.paths import BOXES_DIR, INFO_PATH, PROGRESS_PATH, SIDECAR_DIR
 from demorec.datasets.options import select_episodes
 from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.episode.roles import NO_NAMES, NamedRoles
-from demorec.extensions.datasets.dataset_features import NOT_HELD, why_not_recorded
+from demorec.extensions.datasets.dataset_features import NOT_HELD, is_task_reference, why_not_recorded
 from demorec.extensions.datasets.episode_places import EpisodePlace
 from demorec.extensions.datasets.folder import LeRobotFolder
 from demorec.extensions.datasets.inspect import mistyped_features
