@@ -47,7 +47,7 @@ def planted(bases: Sequence[str], faults: Sequence[str], second: Sequence[str], 
     for base_name in bases:
         made = bench(BASES[base_name], folder / base_name.replace(" ", "_"))
         for name in faults:
-            for other in second:
+            for other in second[:1] if name == "leakage" else second:  # leakage has no second fault
                 said = ""
                 if name == "leakage":
                     found = finds_leakage(made)
