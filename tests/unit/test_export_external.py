@@ -86,9 +86,10 @@ def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) 
     run = run_of(tmp_path / "run", complete(num_frames=5), without, blind, slow)
     report = export(run, tmp_path / "d", exporter)
     assert (report.num_episodes, report.num_frames, report.skipped_failures) == (1, 5, 3)
-    for options, error in (({}, "no image of the camera top"), ({"episodes": "0,2"}, "cameras is none")):
+    cases = {"": "no image of the camera top|cameras is none", "0,2": "cameras is none"}
+    for episodes, error in cases.items():
         with pytest.raises((ExportError, ConfigError), match=error):
-            export(run, tmp_path / "e", exporter, include_failures=True, **options)
+            export(run, tmp_path / "e", exporter, include_failures=True, episodes=episodes)
     other = run_of(tmp_path / "other", make_external(cameras=(), num_frames=5))
     with pytest.raises(ConfigError, match="cameras is none instead of top") as refused:
         export([run, other], tmp_path / "e", exporter)
