@@ -31,10 +31,10 @@ from learning import ACTION, ENVIRONMENT, STATE, SWITCHED_OFF, Data, Variant, co
 
 from demorec.core.config import GenerateConfig
 from demorec.episode.episode import interventions
-from demorec.extensions.policies import TakeOver
 from demorec.extensions.policies.evaluation import Evaluation, load_evaluation
 from demorec.extensions.policies.rollouts import evaluate, settings_for
 from demorec.extensions.policies.statistics import Rate
+from demorec.extensions.policies.takeover import TakeOver
 from demorec.mcap import Recording
 
 INTERVENTION = "intervention"

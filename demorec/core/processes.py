@@ -45,6 +45,7 @@ class _Process(SpawnProcess):
             super().start()
 
     def run(self) -> None:
+        sys.unraisablehook = _exit_if_interrupted
         try:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -157,6 +158,13 @@ def start_program(command: Sequence[str], **options: Any) -> subprocess.Popen[An
 
     parent = os.getpid()
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, preexec_fn=prepare, **options)  # noqa: PLW1509 (two system calls)
+
+
+def _exit_if_interrupted(ignored: sys.UnraisableHookArgs) -> None:
+    """Exit at a Ctrl-C that Python raised in a destructor or a weak reference's callback: it would print and go on."""
+    if ignored.exc_type is KeyboardInterrupt:
+        os._exit(130)
+    sys.__unraisablehook__(ignored)
 
 
 def _end_with_parent() -> None:

@@ -8,8 +8,6 @@ squares with weights and a projected null-space pull (Siciliano et al., Robotics
 An `arm` is the tuple `demorec.robots.kinematics.ArmKinematics.tables`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -20,10 +20,11 @@ from demorec.core.plain import to_plain
 from demorec.core.tables import EXPORTERS
 from demorec.episode.episode import POLICY_PHASE, Frame
 from demorec.episode.features import ActionKind
-from demorec.extensions.policies import TakeOver, rollouts
+from demorec.extensions.policies import rollouts
 from demorec.extensions.policies.evaluation import Evaluation, Settings
 from demorec.extensions.policies.gym_env import DemorecEnv
 from demorec.extensions.policies.rollouts import make_rollout
+from demorec.extensions.policies.takeover import TakeOver
 from demorec.extensions.policies.turns import Turns, read_takeover
 from demorec.extensions.remake.drive import replay_all
 from demorec.generate.options import RunOptions

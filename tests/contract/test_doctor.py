@@ -104,6 +104,7 @@ def resting(state: Array, action: Array) -> tuple[Array, Array]:
 NUMBERS: dict[str, tuple[Change, str]] = {
     "radians": (lambda s, a: (np.radians(s), np.radians(a)), "unit_mismatch"),
     "an action two frames late": (lambda s, a: (s, np.vstack([a[:1], a[:1], a[:-2]])), "action_lag"),
+    "the action of another episode": (lambda s, a: (s, motion(99, len(s))[1] * (1, -1, -1, 1, 1)), "action_lag"),
     "an action that is the state": (lambda s, a: (s, s.copy()), "action_equals_state"),
     "exchanged actions": (lambda s, a: (s, a[:, [1, 0, 2, 3, 4]]), "swapped_elements"),
     "a gripper's action ten frames late": (
@@ -268,6 +269,22 @@ def test_a_late_increment_is_found_in_both_notations(sound: Evidence, form: str)
     diagnosis = diagnose(replace(changed(sound, incremental), roles=find_roles(columns, NO_NAMES)))
     assert found(diagnosis, "action_lag") == {BAD}
     assert "its action is 4" in next(each.message for each in diagnosis.findings if each.check == "action_lag")
+
+
+def test_noisy_increments_of_another_episode_are_found(sound: Evidence) -> None:
+    """The noise, of exploration or of a hand, exceeds the steps, and single ones explain nothing."""
+    names = (*(f"delta_{name.removesuffix('.pos')}" for name in NAMES[:4]), NAMES[4])
+    columns = {"observation.state": Column("float32", NAMES), "action": Column("float32", names)}
+
+    def incremental(number: int, state: Array, action: Array) -> tuple[Array, Array]:
+        place = 99 if number == BAD else number
+        steps = np.diff(motion(place, len(state))[1][:, :4], axis=0, append=action[-1:, :4])
+        noise = np.random.default_rng(number).normal(0, 1.5 * np.abs(steps[:-1]).mean(axis=0), steps.shape)
+        return state, np.column_stack([steps + noise, action[:, 4]])
+
+    diagnosis = diagnose(replace(changed(sound, incremental), roles=find_roles(columns, NO_NAMES)))
+    assert found(diagnosis, "action_lag") == {BAD}
+    assert "action_lag" not in diagnosis.not_measured
 
 
 def test_a_gripper_with_one_wrong_reading_is_not_of_another_unit(sound: Evidence) -> None:

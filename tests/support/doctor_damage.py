@@ -304,3 +304,11 @@ def other_take(dataset: DemoDataset, number: int) -> None:
     episode, other = dataset.episodes[number], dataset.episodes[number - 1]
     rows = np.minimum(np.arange(len(episode.time_s)), len(other.time_s) - 1)
     episode.images = {camera: _changed(draw, lambda shown: shown[rows]) for camera, draw in other.images.items()}
+
+
+def other_action(dataset: DemoDataset, number: int) -> None:
+    """The action of the previous episode, stretched to the length of this one."""
+    episode, other = dataset.episodes[number], dataset.episodes[number - 1]
+    rows = np.linspace(0, len(other.time_s) - 1, len(episode.time_s)).astype(int)
+    name = dataset.base.feature("action")
+    episode.columns[name] = other.columns[name][rows]

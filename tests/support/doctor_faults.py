@@ -114,6 +114,7 @@ FAULTS: dict[str, PlantedFault] = {
     "action late in all": _all(rows.on("action", rows.shifted(0.6), whole=True)),
     "action equal to the state": _one(rows.equal_to_state(whole=False), "absolute"),
     "action equal in all": _all(rows.equal_to_state(whole=True), "absolute"),
+    "action of another episode": _one(rows.other_action),
     "exchanged elements": _one(rows.on("action", rows.exchanged)),
     "exchanged elements in all": _all(rows.on("action", rows.exchanged, whole=True)),
     "inverted gripper": _one(rows.on("action", rows.gripper(1, rows.turned_round))),

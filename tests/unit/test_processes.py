@@ -112,3 +112,17 @@ def test_a_signal_during_exit_prints_no_traceback() -> None:
             [sys.executable, "-c", code.format(handler)], capture_output=True, text=True, check=False
         )
         assert ("Traceback" in ended.stderr) == is_printed
+
+
+def test_ctrl_c_in_a_destructor_ends_a_child_quietly(tmp_path: Path) -> None:
+    """Python would print "Exception ignored in", and the child would go on."""
+    (tmp_path / "work.py").write_text(
+        "import signal\n\nclass Held:\n    def __del__(self):\n        signal.raise_signal(signal.SIGINT)\n\n"
+        "def work():\n    Held()\n    print('it went on', flush=True)\n"
+    )
+    code = (
+        "from work import work; from demorec.core.processes import SPAWN; child = SPAWN.Process(target=work);"
+        "child.start(); child.join(); print(child.exitcode)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (ended.stdout, ended.stderr) == ("130\n", "")

@@ -1,7 +1,5 @@
 """Declaration of the LeRobot datasets that exist already: reading, viewing, checking, editing and repairing them."""
 
-from __future__ import annotations
-
 from demorec.core.extension import CommandRow, Extension, KindRow
 
 EXTENSION = Extension(

@@ -1,7 +1,5 @@
 """Declaration of the doctor, which checks data from any source."""
 
-from __future__ import annotations
-
 from demorec.core.extension import CommandRow, Extension
 
 EXTENSION = Extension(

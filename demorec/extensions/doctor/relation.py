@@ -23,6 +23,9 @@ MAX_UNEXPLAINED = 0.4
 """Maximum ratio of an element's variance left unexplained by its action, for the lag to be judged by it."""
 MIN_MOTION = 0.2
 """Minimum motion of an element in an episode judged by it, as a ratio of its usual range."""
+SUM_S = 0.2
+"""Time over which increments are summed if single ones do not explain the motion, as noise of the controller or of
+exploration may prevent."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,22 +48,33 @@ class ActionRelation:
     """Relation of state and action in a set of episodes.
 
     Attributes:
-        kind: "target": the action is the position to reach; "increment": the change until the next frame.
+        window: 0: the action is the position to reach. Else it is the change until the next frame, and its sums over
+            this number of frames are compared with the state's changes.
         lags: (L,) tried lags, frames.
         elements, columns: (K,) elements of the arm in the state, and the matching ones in the action.
         episodes: Number of an episode -> its lag, for those that move enough.
     """
 
-    kind: Literal["target", "increment"]
+    window: int
     lags: NDArray[np.intp]
     elements: NDArray[np.intp]
     columns: NDArray[np.intp]
     episodes: Mapping[int, EpisodeLag]
 
     @property
+    def kind(self) -> Literal["target", "increment"]:
+        """Meaning of the action."""
+        return "increment" if self.window else "target"
+
+    @property
     def usual_lag(self) -> float:
         """Median over the episodes."""
         return float(np.median([episode.lag for episode in self.episodes.values()]))
+
+    def compared(self, episode: EpisodeEvidence, lag: int) -> tuple[Array, Array]:
+        """Return (N, K) of the state and (N, K) of the action that precedes it by the lag: positions, or changes."""
+        state, action = _compared(*_paired(episode, self.elements, self.columns), self.window)
+        return state[max(lag, 0) : len(state) + min(lag, 0)], action[max(-lag, 0) : len(action) - max(lag, 0)]
 
 
 def relation_of(evidence: Evidence) -> ActionRelation:
@@ -84,35 +98,49 @@ def relation_of(evidence: Evidence) -> ActionRelation:
     lags = np.arange(-reach, reach + 1)  # not before: a stated rate of 2**31 would fill the memory
     best: ActionRelation | None = None
     fit = MAX_UNEXPLAINED
-    for kind in ("target", "increment"):
-        curves = {each.number: _curves(each, kind, elements, columns, lags, evidence) for each in long}
+    for window in (0, 1, round(SUM_S * evidence.fps)):
+        if window > 1 and best is not None:
+            break
+        curves = {}
+        for each in long:
+            curves[each.number] = _curves(*_paired(each, elements, columns), window, lags, evidence.ranges[elements])
         unexplained = _usual_minimum(list(curves.values()))
         if unexplained < fit:
             fit = unexplained
             found = {number: _lag(curve, lags) for number, curve in curves.items()}
-            known = {number: lag for number, lag in found.items() if lag is not None}
-            best = ActionRelation(kind=kind, lags=lags, elements=elements, columns=columns, episodes=known)
+            best = ActionRelation(
+                window=window,
+                lags=lags,
+                elements=elements,
+                columns=columns,
+                episodes={number: lag for number, lag in found.items() if lag is not None},
+            )
     if best is None or not best.episodes:
         raise NotMeasuredError("the state follows the action neither as a target nor as an increment")
     return best
 
 
-def _curves(
-    episode: EpisodeEvidence,
-    kind: str,
-    elements: NDArray[np.intp],
-    columns: NDArray[np.intp],
-    lags: NDArray[np.intp],
-    evidence: Evidence,
-) -> Array:
-    """Compute (L, K) ratio of each element's variance left unexplained by its action at each lag; NaN if it rests."""
+def _paired(episode: EpisodeEvidence, elements: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Return (T, K) of the state and (T, K) of the action, paired elements only."""
     assert episode.state is not None
     assert episode.action is not None
-    state, action = episode.state[:, elements], episode.action[:, columns]
-    moved = np.ptp(state, axis=0) >= MIN_MOTION * evidence.ranges[elements]
-    follows = state if kind == "target" else np.diff(state, axis=0, append=state[-1:])
-    unexplained = 1 - lagged_correlations(follows, action, int(lags[0]), int(lags[-1])) ** 2
-    return np.where(moved & (np.ptp(action, axis=0) > 0), np.maximum(unexplained, 1e-9), np.nan)
+    return episode.state[:, elements], episode.action[:, columns]
+
+
+def _compared(state: Array, action: Array, window: int) -> tuple[Array, Array]:
+    """Return the state and the action, or from each frame on the change of the state and the sum of its increments."""
+    if window == 0:
+        return state, action
+    later = np.minimum(np.arange(len(state)) + window, len(state) - 1)
+    sums = np.cumsum(action, axis=0) - action  # of the increments before each frame
+    return state[later] - state, sums[later] - sums
+
+
+def _curves(state: Array, action: Array, window: int, lags: NDArray[np.intp], usual_ranges: Array) -> Array:
+    """Compute (L, K) ratio of each element's variance left unexplained by its action at each lag; NaN if it rests."""
+    moved = (np.ptp(state, axis=0) >= MIN_MOTION * usual_ranges) & (np.ptp(action, axis=0) > 0)
+    unexplained = 1 - lagged_correlations(*_compared(state, action, window), int(lags[0]), int(lags[-1])) ** 2
+    return np.where(moved, np.maximum(unexplained, 1e-9), np.nan)
 
 
 def _usual_minimum(curves: list[Array]) -> float:

@@ -1,7 +1,5 @@
 """Declaration of language, progress and bounding boxes."""
 
-from __future__ import annotations
-
 from demorec.core.extension import Extension, ExtraFilesRow
 
 EXTENSION = Extension(

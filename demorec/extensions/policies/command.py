@@ -15,7 +15,7 @@ from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.options import Rare
 from demorec.core.replacing import OptionalTarget
-from demorec.extensions.policies import TakeOver
+from demorec.extensions.policies.takeover import TakeOver
 
 if TYPE_CHECKING:
     from demorec.extensions.policies.evaluation import Evaluation

@@ -17,8 +17,8 @@ from demorec.core.own_versions import version_differences
 from demorec.core.plain import from_plain, plain_differences, to_plain
 from demorec.core.replacing import ReplaceableKind, check_replaceable, delete_parts, json_object, obstacle
 from demorec.episode.features import ActionKind, StateKind
-from demorec.extensions.policies import TakeOver
 from demorec.extensions.policies.statistics import Rate
+from demorec.extensions.policies.takeover import TakeOver
 from demorec.generate.contents import foreign_recordings
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt

@@ -22,9 +22,9 @@ import numpy as np
 from demorec.core.geometry import Array, angle_between
 from demorec.episode.episode import POLICY_PHASE, Action, Frame, Observation
 from demorec.episode.scene import Goal
-from demorec.extensions.policies import TakeOver
 from demorec.extensions.policies.gym_env import SUCCESS_FRAMES, DemorecEnv, Situation
 from demorec.extensions.policies.policy import Policy
+from demorec.extensions.policies.takeover import TakeOver
 from demorec.loop import PreparedEpisode, Session
 from demorec.loop.session import ActionNoise
 from demorec.mcap import open_simulated

@@ -8,8 +8,8 @@ import numpy as np
 
 from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.evidence import DROP, Evidence
-from demorec.extensions.doctor.relation import ActionRelation, EpisodeLag, relation_of
+from demorec.extensions.doctor.evidence import DROP, LOOK_OR_DROP, Evidence
+from demorec.extensions.doctor.relation import MIN_MOTION, ActionRelation, EpisodeLag, relation_of
 from demorec.extensions.doctor.robust import lagged_correlations, usual
 from demorec.extensions.doctor.units import BOUND_QUANTILES
 
@@ -27,6 +27,13 @@ MIN_GRIPPER_WAIT_S = 0.3
 """Minimum additional delay of a gripper whose action is early."""
 MIN_GRIPPER_GAIN = 1.4
 """As MIN_GAIN, for a gripper: a factor of four."""
+MAX_OWN = 0.5
+"""Maximum ratio of the variance that an episode's own action leaves unexplained; one of another episode explains some,
+as tasks repeat."""
+MAX_CLOSE_OWN = 0.1
+"""The same where most states follow their action closely."""
+MIN_FOREIGN_FACTOR = 10.0
+"""Minimum factor over the usual ratio there."""
 MIN_LEAD = 0.25
 """Minimum lead, frames, of the state over its action that indicates misalignment: a command is never late."""
 MAX_LAG_S = 0.35
@@ -49,7 +56,7 @@ MIN_PAIR_GAIN = 4.0
 @check(
     family="alignment",
     needs="state, action",
-    measures="actions that come late or early",
+    measures="actions that come late or early, or belong elsewhere",
     unit="frames",
     why="A policy learns the action that belongs to an observation: a shift of a few frames makes it lag or oscillate.",
     do="shift the action in the program that recorded it, or drop the episodes: " + DROP,
@@ -59,7 +66,7 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
 
     The lag is where the action explains most of the state's motion, as a target or as an increment. The state may
     follow by up to 0.35 s, but cannot lead; a velocity measured in its frame is half a frame late. An episode is judged
-    by its difference from the usual lag.
+    by its difference from the usual lag, and by the motion that its action leaves unexplained at any lag.
     """
     relation = evidence.once(relation_of)
     usual_lag = relation.usual_lag
@@ -88,8 +95,23 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
         )
     if is_outside or len(relation.episodes) <= MIN_OTHERS:
         return
-    _, spread = usual([episode.lag for episode in relation.episodes.values()], floor=0.1)
-    for number, episode in relation.episodes.items():
+    unexplained = _unexplained(evidence, relation)
+    usual_ratio, ratio_spread = usual(list(unexplained.values()))
+    most = min(MAX_OWN, max(MAX_CLOSE_OWN, MIN_FOREIGN_FACTOR * usual_ratio))
+    most = max(most, usual_ratio + 3 * ratio_spread)
+    foreign = {number: ratio for number, ratio in unexplained.items() if ratio > most}
+    for number, ratio in foreign.items():
+        yield Fault(
+            severity="look",
+            episode=number,
+            value=f"{ratio:.0%} unexplained",
+            message=f"its action leaves {ratio:.0%} of its motion unexplained (others: {usual_ratio:.0%}): is it of "
+            "another episode?",
+            do=LOOK_OR_DROP,
+        )
+    known = {number: episode for number, episode in relation.episodes.items() if number not in foreign}
+    _, spread = usual([episode.lag for episode in known.values()], floor=0.1)
+    for number, episode in known.items():
         shift = episode.lag - usual_lag
         side = "late" if shift < 0 else "early"
         if abs(shift) > max(MIN_SHIFT, 6 * spread) and _prefers(episode, relation, shift):
@@ -100,6 +122,30 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
                 message=f"its action is {abs(shift):.1f} frames {side}: the state follows it by {episode.lag:+.1f} "
                 f"frames (others: {usual_lag:+.1f})",
             )
+
+
+def _unexplained(evidence: Evidence, relation: ActionRelation) -> dict[int, float]:
+    """Compute episode -> ratio of the variance that its action leaves unexplained at its own lag, if it has one.
+
+    It is the mean over the moving elements. An element that moves against its action, unlike in most episodes, counts
+    as unexplained.
+    """
+    found: dict[int, Array] = {}
+    for episode, state in evidence.need_state():
+        if episode.action is not None and episode.length > 3 * relation.lags[-1]:
+            own = relation.episodes.get(episode.number)
+            pair = relation.compared(episode, round(relation.usual_lag if own is None else own.lag))
+            one, two = (part - part.mean(axis=0) for part in pair)
+            size = np.sqrt((one**2).sum(axis=0) * (two**2).sum(axis=0))
+            moves = np.ptp(state, axis=0) >= MIN_MOTION * evidence.ranges
+            correlation = (one * two).sum(axis=0) / np.where(size > 0, size, 1.0)
+            found[episode.number] = np.where(moves[relation.elements], correlation, np.nan)
+    signs = np.sign([usual(column)[0] for column in np.stack(list(found.values())).T])
+    return {
+        number: float(np.nanmean(1 - np.maximum(signs * correlation, 0) ** 2))
+        for number, correlation in found.items()
+        if np.isfinite(signs * correlation).any()
+    }
 
 
 def _prefers(episode: EpisodeLag, relation: ActionRelation, shift: float) -> bool:
@@ -202,14 +248,7 @@ def swapped_elements(evidence: Evidence) -> Iterator[Fault]:
 
 def _unexplained_by_any(evidence: Evidence, relation: ActionRelation, number: int, lag: int) -> Array:
     """Compute (K, K) ratio of the variance of state i that action j leaves unexplained; NaN if one of them rests."""
-    episode = evidence.by_number[number]
-    assert episode.state is not None
-    assert episode.action is not None
-    state, action = episode.state[:, relation.elements], episode.action[:, relation.columns]
-    if relation.kind == "increment":
-        state = np.diff(state, axis=0, append=state[-1:])
-    first, last = max(lag, 0), len(state) + min(lag, 0)
-    one, two = state[first:last], action[first - lag : last - lag]
+    one, two = relation.compared(evidence.by_number[number], lag)
     one, two = one - one.mean(axis=0), two - two.mean(axis=0)
     sizes = np.outer((one**2).sum(axis=0), (two**2).sum(axis=0))
     return np.where(sizes > 0, 1 - (one.T @ two) ** 2 / np.where(sizes > 0, sizes, 1.0), np.nan)

@@ -1,8 +1,6 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
 """Pixels of 2x2 samples: shaded once or sample by sample, with the depth at the centre."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from demorec.render.raster.kernels import layout as at

@@ -5,8 +5,6 @@ Corners are snapped to 1/256 sample, so that the edge functions are integers, ex
 belong to the triangle for which it is a top or left edge.
 """
 
-from __future__ import annotations
-
 import math
 
 from demorec.render.raster.kernels.jit import f4, f8, i4, index, inlined

@@ -1,8 +1,6 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
 """Lookups of every shaded point: shadow, texture, light, tone. All paths share this arithmetic, so that they agree."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from demorec.render.raster.kernels.jit import f4, i4, index, inlined, u4

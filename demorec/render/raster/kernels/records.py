@@ -1,8 +1,6 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
 """The image planes of the triangles' attributes, for shading."""
 
-from __future__ import annotations
-
 from demorec.render.raster.kernels import layout as at
 from demorec.render.raster.kernels.fill import doubled_area, screen
 from demorec.render.raster.kernels.jit import f4, f8, index, inlined, kernel

@@ -6,8 +6,6 @@ the shadow is looked up for the whole row, then colours are computed. Simple loo
 the compiler, become vector code; the gathers have separate loops.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from demorec.render.raster.kernels import layout as at

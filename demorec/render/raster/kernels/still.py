@@ -1,8 +1,6 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
 """Static surfaces before a fixed camera: kept between images, with shadows updated only where they may change."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from demorec.render.raster.kernels import layout as at

@@ -1,8 +1,6 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
 """Drawing of meshes into the image, clipped and without back faces, and into the shadow map."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from demorec.render.raster.kernels import layout as at

@@ -1,8 +1,6 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
 """Transformation of vertices from link poses to the screen, the light and the shadow map."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
