@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-from demorec.core.errors import DemorecError, MissingDependencyError, resource_error
+from demorec.core.errors import DemorecError, MissingDependencyError, resource_error, without_path
 
 Severity = Literal["look", "broken"]
 """broken: training fails or gives wrong results. look: unusual, to be examined by a person."""
@@ -160,7 +160,7 @@ class Check:
             # Data that break one check in an unforeseen way must not hide the findings of the others.
             logging.getLogger(__name__).debug("check %s", self.name, exc_info=True)
             reason = str(error) if isinstance(error, DemorecError) else "it cannot be computed on these data"
-            reason = reason.replace(f"{subject.path}/", "")
+            reason = without_path(reason, subject.path)
             if self.family == "files":
                 found.append(self._finding(Fault(severity="broken", message=reason), path))
                 reason = ""

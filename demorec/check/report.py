@@ -12,7 +12,7 @@ from typing import Literal
 from demorec.check.base import RANK, Check, Checkable, CheckResult, Finding, Form, Verdict
 from demorec.check.file import CheckedEpisode
 from demorec.check.run import CheckedRun
-from demorec.core.errors import check_option
+from demorec.core.errors import check_option, without_path
 from demorec.core.extension import rows_of
 from demorec.core.processes import in_turn
 from demorec.core.tables import FILE_CHECKS
@@ -140,7 +140,7 @@ def _run(options: CheckOptions, subject: Checkable, form: Form) -> Iterator[Chec
 
 def _within(path: Path, finding: Finding) -> Finding:
     """Remove the subject's path from a message; the report prints it above."""
-    return replace(finding, message=finding.message.removesuffix(f": {path}").replace(f"{path}/", ""))
+    return replace(finding, message=without_path(finding.message, path))
 
 
 @dataclass(frozen=True, kw_only=True)

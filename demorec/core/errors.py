@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import struct
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor
@@ -178,9 +179,12 @@ def describe_error(error: BaseException) -> str:
     return lines[0].rstrip(".")[:_MAX_WORDS] or "no reason is given"
 
 
-def without_path(error: BaseException, path: Path) -> str:
-    """Message of a demorec error without the path at its end, for a sentence that already names the path."""
-    return str(error).removesuffix(f": {path}")
+def without_path(message: BaseException | str, path: Path) -> str:
+    """Message of a demorec error without the path at its end, and with files below it relative to it, for a sentence
+    that already names the path.
+    """
+    text = str(message).removesuffix(f": {path}")
+    return re.sub(rf"(?<![^\s('\"]){re.escape(str(path))}/", "", text)
 
 
 def as_reason(error: BaseException) -> str:

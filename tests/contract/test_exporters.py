@@ -14,6 +14,7 @@ from support.recording import make_episode
 from demorec.cli.shared.paths import refuse_inside
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
+from demorec.core.extension import exporter_rows
 from demorec.core.tables import EXPORTERS
 from demorec.extensions.recovery.recover import recover
 from demorec.mcap import EpisodeWriter, Recording
@@ -64,7 +65,8 @@ def test_sensor_features_are_exported_by_name(exporter: str, run: Path, tmp_path
 
 def test_its_result_is_recognised(exporter: str, run: Path, tmp_path: Path) -> None:
     """Every command that is given the result recognises it; in a folder, none writes anything else."""
-    out = tmp_path / "d"
+    suffixes = exporter_rows()[exporter].suffixes or ("",)
+    out = tmp_path / f"d{suffixes[0]}"
     export(run, out, exporter)
     kind = find(out).kind
     assert kind not in ("nothing", "unreadable")

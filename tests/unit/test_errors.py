@@ -12,7 +12,7 @@ import av
 import pytest
 from support.present import present
 
-from demorec.core.errors import RecordingError, describe_error, resource_error
+from demorec.core.errors import RecordingError, describe_error, resource_error, without_path
 
 
 @pytest.mark.parametrize(
@@ -82,3 +82,10 @@ def test_errors_of_python_are_described_in_words(code: str, words: str) -> None:
     error = _raised(code)
     assert describe_error(error) == words
     assert describe_error(RecordingError("The recording is damaged: a.mcap")) == "The recording is damaged: a.mcap"
+
+
+def test_a_message_names_files_relative_to_their_folder() -> None:
+    """A folder with the short name "a" leaves "meta/info.json" alone."""
+    for folder in (Path("a"), Path("/data/a")):
+        error = RecordingError(f"meta/info.json and {folder}/meta/tasks.jsonl ('{folder}/data') differ: {folder}")
+        assert without_path(error, folder) == "meta/info.json and meta/tasks.jsonl ('data') differ"

@@ -103,7 +103,7 @@ def noted(problems: list[str], root: Path) -> Iterator[None]:
     except ExportError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        problems.append(without_path(error, root).replace(f"{root}/", ""))
+        problems.append(without_path(error, root))
 
 
 def usable_numbers(folder: LeRobotFolder, rows: DataRows, place: EpisodePlace) -> dict[str, NDArray[Any]]:

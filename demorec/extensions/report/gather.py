@@ -291,7 +291,7 @@ def _read(
     except (RecordingError, ExportError) as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        return ReportedEpisode(name=path.stem, problem=without_path(error, path).replace(f"{path}/", ""))
+        return ReportedEpisode(name=path.stem, problem=without_path(error, path))
 
 
 def _judged(episode: ReportedEpisode, number: int, diagnosis: Diagnosis | None) -> ReportedEpisode:

@@ -9,7 +9,7 @@ import numpy as np
 from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import DROP, LOOK_OR_DROP, Evidence
-from demorec.extensions.doctor.relation import MIN_MOTION, ActionRelation, EpisodeLag, relation_of
+from demorec.extensions.doctor.relation import ActionRelation, EpisodeLag, relation_of
 from demorec.extensions.doctor.robust import lagged_correlations, usual
 from demorec.extensions.doctor.units import BOUND_QUANTILES
 
@@ -58,7 +58,7 @@ MIN_PAIR_GAIN = 4.0
     needs="state, action",
     measures="actions that come late or early, or belong elsewhere",
     unit="frames",
-    why="A policy learns the action that belongs to an observation: a shift of a few frames makes it lag or oscillate.",
+    why="A policy learns the action of each observation: that of another moment makes it lag, oscillate or stray.",
     do="shift the action in the program that recorded it, or drop the episodes: " + DROP,
 )
 def action_lag(evidence: Evidence) -> Iterator[Fault]:
@@ -102,7 +102,7 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
     foreign = {number: ratio for number, ratio in unexplained.items() if ratio > most}
     for number, ratio in foreign.items():
         yield Fault(
-            severity="look",
+            severity="broken" if ratio > MIN_FOREIGN_FACTOR * usual_ratio else "look",
             episode=number,
             value=f"{ratio:.0%} unexplained",
             message=f"its action leaves {ratio:.0%} of its motion unexplained (others: {usual_ratio:.0%}): is it of "
@@ -125,26 +125,26 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _unexplained(evidence: Evidence, relation: ActionRelation) -> dict[int, float]:
-    """Compute episode -> ratio of the variance that its action leaves unexplained at its own lag, if it has one.
+    """Compute episode -> ratio of its motion that its action leaves unexplained at its own lag, if it has one.
 
-    It is the mean over the moving elements. An element that moves against its action, unlike in most episodes, counts
-    as unexplained.
+    Variances of the elements are added in units of their usual ranges, so that noise on one that hardly moves counts
+    little. Motion against the action, unlike in most episodes, counts as unexplained.
     """
-    found: dict[int, Array] = {}
-    for episode, state in evidence.need_state():
+    motions: dict[int, Array] = {}
+    correlations: dict[int, Array] = {}
+    for episode, _ in evidence.need_state():
         if episode.action is not None and episode.length > 3 * relation.lags[-1]:
             own = relation.episodes.get(episode.number)
             pair = relation.compared(episode, round(relation.usual_lag if own is None else own.lag))
             one, two = (part - part.mean(axis=0) for part in pair)
             size = np.sqrt((one**2).sum(axis=0) * (two**2).sum(axis=0))
-            moves = np.ptp(state, axis=0) >= MIN_MOTION * evidence.ranges
-            correlation = (one * two).sum(axis=0) / np.where(size > 0, size, 1.0)
-            found[episode.number] = np.where(moves[relation.elements], correlation, np.nan)
-    signs = np.sign([usual(column)[0] for column in np.stack(list(found.values())).T])
+            correlations[episode.number] = (one * two).sum(axis=0) / np.where(size > 0, size, 1.0)
+            motions[episode.number] = one.var(axis=0) / evidence.ranges[relation.elements] ** 2
+    signs = np.sign(np.median(list(correlations.values()), axis=0))
     return {
-        number: float(np.nanmean(1 - np.maximum(signs * correlation, 0) ** 2))
-        for number, correlation in found.items()
-        if np.isfinite(signs * correlation).any()
+        number: float(motion @ (1 - np.maximum(signs * correlations[number], 0) ** 2) / motion.sum())
+        for number, motion in motions.items()
+        if motion.any()
     }
 
 

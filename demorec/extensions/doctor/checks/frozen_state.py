@@ -15,7 +15,7 @@ from demorec.extensions.doctor.checks.numbers import MIN_OTHERS, element_name
 from demorec.extensions.doctor.evidence import DROP, EpisodeEvidence, Evidence
 from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.robust import runs
-from demorec.extensions.doctor.units import moving_elements, state_bounds
+from demorec.extensions.doctor.units import moving_elements, other_units, state_bounds
 
 MIN_FROZEN_S = 0.4
 MIN_FROZEN_FRAMES = 5
@@ -65,7 +65,10 @@ def frozen_state(evidence: Evidence) -> Iterator[Fault]:
     targets = _targets(evidence, episodes)
     needed = max(MIN_FROZEN_FRAMES, round(MIN_FROZEN_S * evidence.fps))
     faults: list[Fault] = []
+    others = evidence.once(other_units)
     for episode, state in episodes:
+        if episode.number in others:
+            continue
         fault = _frozen_element(evidence, targets, episode, state, needed) or _frozen_whole(
             evidence, episode, state, needed
         )

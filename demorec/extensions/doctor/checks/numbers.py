@@ -93,11 +93,12 @@ def unit_mismatch(evidence: Evidence) -> Iterator[Fault]:
     evidence.need_state()
     for number, ratios in evidence.once(other_units).items():
         ratio = next(iter(ratios.values()))
+        what = f"{' and '.join(ratios)} {'are' if len(ratios) > 1 else 'is'}"
         yield Fault(
             severity="broken",
             episode=number,
             value=f"{ratio:.3g} times",
-            message=f"its {' and '.join(ratios)} is {_in_words(ratio)} the size of the others' ({_confusion(ratio)})",
+            message=f"its {what} {_in_words(ratio)} the size of the others' ({_confusion(ratio)})",
         )
     yield from _gripper_units(evidence)
     yield from _action_units(evidence)
