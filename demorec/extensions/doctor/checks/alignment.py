@@ -95,21 +95,10 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
         )
     if is_outside or len(relation.episodes) <= MIN_OTHERS:
         return
-    unexplained = _unexplained(evidence, relation)
-    usual_ratio, ratio_spread = usual(list(unexplained.values()))
-    most = min(MAX_OWN, max(MAX_CLOSE_OWN, MIN_FOREIGN_FACTOR * usual_ratio))
-    most = max(most, usual_ratio + 3 * ratio_spread)
-    foreign = {number: ratio for number, ratio in unexplained.items() if ratio > most}
-    for number, ratio in foreign.items():
-        yield Fault(
-            severity="broken" if ratio > MIN_FOREIGN_FACTOR * usual_ratio else "look",
-            episode=number,
-            value=f"{ratio:.0%} unexplained",
-            message=f"its action leaves {ratio:.0%} of its motion unexplained (others: {usual_ratio:.0%}): is it of "
-            "another episode?",
-            do=LOOK_OR_DROP,
-        )
-    known = {number: episode for number, episode in relation.episodes.items() if number not in foreign}
+    foreign = list(_foreign_actions(evidence, relation))
+    yield from foreign
+    of_others = {fault.episode for fault in foreign}
+    known = {number: episode for number, episode in relation.episodes.items() if number not in of_others}
     _, spread = usual([episode.lag for episode in known.values()], floor=0.1)
     for number, episode in known.items():
         shift = episode.lag - usual_lag
@@ -122,6 +111,25 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
                 message=f"its action is {abs(shift):.1f} frames {side}: the state follows it by {episode.lag:+.1f} "
                 f"frames (others: {usual_lag:+.1f})",
             )
+
+
+def _foreign_actions(evidence: Evidence, relation: ActionRelation) -> Iterator[Fault]:
+    """Find episodes with an action that leaves far more of their motion unexplained than in the others."""
+    unexplained = _unexplained(evidence, relation)
+    usual_ratio, ratio_spread = usual(list(unexplained.values()))
+    most = min(MAX_OWN, max(MAX_CLOSE_OWN, MIN_FOREIGN_FACTOR * usual_ratio))
+    most = max(most, usual_ratio + 3 * ratio_spread)
+    for number, ratio in unexplained.items():
+        if ratio <= most:
+            continue
+        yield Fault(
+            severity="broken" if ratio > MIN_FOREIGN_FACTOR * usual_ratio else "look",
+            episode=number,
+            value=f"{ratio:.0%} unexplained",
+            message=f"its action leaves {ratio:.0%} of its motion unexplained (others: {usual_ratio:.0%}): is it of "
+            "another episode?",
+            do=LOOK_OR_DROP,
+        )
 
 
 def _unexplained(evidence: Evidence, relation: ActionRelation) -> dict[int, float]:
