@@ -31,9 +31,11 @@ MAX_OWN = 0.5
 """Maximum ratio of the variance that an episode's own action leaves unexplained; one of another episode explains some,
 as tasks repeat."""
 MAX_CLOSE_OWN = 0.1
-"""The same where most states follow their action closely."""
+"""The same where most states follow a target closely."""
 MIN_FOREIGN_FACTOR = 10.0
 """Minimum factor over the usual ratio there."""
+MIN_WEIGHED_RANGE = 0.2
+"""Minimum range by which motion is divided, relative to the largest usual one: a parked arm sways by a tick or two."""
 MIN_LEAD = 0.25
 """Minimum lead, frames, of the state over its action that indicates misalignment: a command is never late."""
 MAX_LAG_S = 0.35
@@ -117,7 +119,9 @@ def _foreign_actions(evidence: Evidence, relation: ActionRelation) -> Iterator[F
     """Find episodes with an action that leaves far more of their motion unexplained than in the others."""
     unexplained = _unexplained(evidence, relation)
     usual_ratio, ratio_spread = usual(list(unexplained.values()))
-    most = min(MAX_OWN, max(MAX_CLOSE_OWN, MIN_FOREIGN_FACTOR * usual_ratio))
+    most = MAX_OWN
+    if relation.kind == "target":
+        most = min(MAX_OWN, max(MAX_CLOSE_OWN, MIN_FOREIGN_FACTOR * usual_ratio))
     most = max(most, usual_ratio + 3 * ratio_spread)
     for number, ratio in unexplained.items():
         if ratio <= most:
@@ -135,9 +139,12 @@ def _foreign_actions(evidence: Evidence, relation: ActionRelation) -> Iterator[F
 def _unexplained(evidence: Evidence, relation: ActionRelation) -> dict[int, float]:
     """Compute episode -> ratio of its motion that its action leaves unexplained at its own lag, if it has one.
 
-    Variances of the elements are added in units of their usual ranges, so that noise on one that hardly moves counts
-    little. Motion against the action, unlike in most episodes, counts as unexplained.
+    Variances of the elements are added in units of their usual ranges, each up to its usual one: so noise on one that
+    hardly moves, or an angle that jumps by a turn, counts little. Motion against the action, unlike in most episodes,
+    counts as unexplained.
     """
+    ranges = evidence.ranges[relation.elements]
+    ranges = np.maximum(ranges, MIN_WEIGHED_RANGE * ranges.max())
     motions: dict[int, Array] = {}
     correlations: dict[int, Array] = {}
     for episode, _ in evidence.need_state():
@@ -147,8 +154,10 @@ def _unexplained(evidence: Evidence, relation: ActionRelation) -> dict[int, floa
             one, two = (part - part.mean(axis=0) for part in pair)
             size = np.sqrt((one**2).sum(axis=0) * (two**2).sum(axis=0))
             correlations[episode.number] = (one * two).sum(axis=0) / np.where(size > 0, size, 1.0)
-            motions[episode.number] = one.var(axis=0) / evidence.ranges[relation.elements] ** 2
+            motions[episode.number] = one.var(axis=0) / ranges**2
     signs = np.sign(np.median(list(correlations.values()), axis=0))
+    most = np.median(list(motions.values()), axis=0)
+    motions = {number: np.minimum(motion, most) for number, motion in motions.items()}
     return {
         number: float(motion @ (1 - np.maximum(signs * correlations[number], 0) ** 2) / motion.sum())
         for number, motion in motions.items()
